@@ -85,7 +85,8 @@ double seconds_since(std::chrono::steady_clock::time_point start) {
 void holdfast::bind_entropy(nb::module_& module) {
     define(module, "use_threads_from",
            [](double nanoseconds) { return use_threads_from(nanoseconds); });
-    define(module, "use_ball_work", [](double nanoseconds) { return use_ball_work(nanoseconds); });
+    define(module, "use_blocks_beyond",
+           [](std::size_t points) { return use_blocks_beyond(points); });
     define(module, "threads_started", [] { return threads_started(); });
     // The caller keeps the flag alive until it watches another one, or none.
     define(

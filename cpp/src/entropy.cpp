@@ -1,9 +1,9 @@
 #include "entropy.hpp"
 
 #include <algorithm>
+#include <atomic>
 #include <limits>
 #include <memory>
-#include <utility>
 #include <vector>
 
 #include "deterministic_math.hpp"
@@ -29,19 +29,9 @@ constexpr std::size_t compact_limit = 24;
 // Of all points: below it the lists of near points hold too few of a posterior.
 constexpr double grouped_share = 0.12;
 constexpr double grouped_cost_of_a_point = 1000.0;
-// Points of a tree up to which its leaves are taken one by one, and from which on in blocks: faster
-// where they are dense. (Sums are rounded otherwise, so this number may change bits.)
-constexpr std::size_t by_leaves_up_to = 4096;
-// With more points in a tree the work on balls can have a bound, for all trees of a call: where it
-// would take more, one point stands for several neighbours. It is foretold from some pieces and the
-// cost of a leaf that a ball cuts, for each coordinate and each eight posteriors. There is none by
-// default: in six dimensions the error is too large (docs/decisions/many_entropies.md).
-constexpr std::size_t exact_up_to = 16384;
-double most_ball_work = infinity;
-constexpr std::size_t sampled_pieces = 16;
-constexpr double cost_of_a_coordinate = 1.5;
-constexpr double cost_of_sums = 2.5;
-constexpr std::size_t most_stride = 128;
+// Points of a tree up to which its leaves are taken one by one, and beyond which in blocks: faster
+// where the points are dense, but sums are rounded otherwise, so this number may change bits.
+std::atomic<std::size_t> by_leaves_up_to{16384};
 // Nanoseconds for each likelihood, with the entropies that follow.
 constexpr double work_that_follows = 10.0;
 
@@ -213,70 +203,37 @@ class Group {
                  node_weights_.data(),
                  node_counts_.data(),
                  neighbors_.data()};
-        partial_.resize(tree.leaves * columns);
-        visited_.resize(tree.leaves);
-        if (in_blocks()) open_.resize(tree.leaves);
+        partial_.resize(pieces() * columns);
+        visited_.resize(pieces());
     }
 
     /// The leaves are worked on in so many pieces, from several threads at once.
     std::size_t pieces() const { return (tree_.leaves + leaves_of_piece_ - 1) / leaves_of_piece_; }
 
-    /// The terms of the points of a piece; in blocks those that need no balls.
+    /// The terms of the points of a piece.
     void add_piece(std::size_t piece) {
         const std::size_t leaf = piece * leaves_of_piece_;
-        double* terms = &partial_[leaf * view_.vectors * lane_count];
-        std::uint64_t* visits = &visited_[leaf];
-        if (in_blocks()) {
-            task_.kernels->block_lists(view_, leaf, leaves_from(leaf), task_.constants, scratch(),
-                                       terms, &open_[leaf], visits);
-        } else if (task_.settings->estimator == Estimator::gaussian_mixture) {
+        double* terms = &partial_[piece * view_.vectors * lane_count];
+        std::uint64_t* visits = &visited_[piece];
+        thread_local std::vector<double> scratch;
+        scratch.resize(task_.settings->neighbors);
+        if (task_.settings->estimator == Estimator::gaussian_mixture) {
             task_.kernels->group_mixture(view_, leaf, task_.settings->exponent, terms, visits);
+        } else if (leaves_of_piece_ == 1) {
+            task_.kernels->group_nearest(view_, leaf, task_.constants, scratch.data(), terms,
+                                         visits);
         } else {
-            task_.kernels->group_nearest(view_, leaf, task_.constants, scratch(), terms, visits);
+            task_.kernels->block_nearest(view_, leaf,
+                                         std::min(leaves_of_piece_, tree_.leaves - leaf),
+                                         task_.constants, scratch.data(), terms, visits);
         }
     }
 
-    bool in_blocks() const { return leaves_of_piece_ > 1; }
-
-    /// Once all pieces are added: sees to it that their balls take no more than about so many
-    /// nanoseconds.
-    void bound_balls(double nanoseconds) {
-        if (tree_.count <= exact_up_to) return;
-        const std::size_t all = pieces(), some = std::min<std::size_t>(all, sampled_pieces);
-        std::uint64_t cuts = 0;
-        for (std::size_t i = 0; i < some; ++i) {
-            const std::size_t leaf = i * all / some * leaves_of_piece_;
-            cuts += task_.kernels->block_cuts(view_, leaf, leaves_from(leaf), &open_[leaf],
-                                              task_.constants.resolution);
-        }
-        const double work = static_cast<double>(cuts) * static_cast<double>(all) /
-                            static_cast<double>(some) *
-                            (cost_of_a_coordinate * static_cast<double>(tree_.dimension) +
-                             cost_of_sums * static_cast<double>(view_.vectors));
-        while (static_cast<double>(stride_) * nanoseconds < work && stride_ < most_stride) {
-            stride_ *= 2;
-        }
-    }
-
-    /// Those pieces are larger where one point stands for several.
-    std::size_t ball_pieces() const {
-        return (tree_.leaves + leaves_of_ball_piece() - 1) / leaves_of_ball_piece();
-    }
-
-    /// The terms of the points of such a piece that need balls.
-    void add_balls(std::size_t piece) {
-        const std::size_t leaf = piece * leaves_of_ball_piece();
-        task_.kernels->block_balls(view_, leaf,
-                                   std::min(leaves_of_ball_piece(), tree_.leaves - leaf),
-                                   &open_[leaf], stride_, task_.constants, scratch(),
-                                   &partial_[leaf * view_.vectors * lane_count], &visited_[leaf]);
-    }
-
-    /// Partial sums are added in the order of the leaves.
+    /// Partial sums are added in the order of the pieces.
     double entropy(std::size_t member) const {
         double sum = 0.0;
-        for (std::size_t leaf = 0; leaf < tree_.leaves; ++leaf) {
-            sum += partial_[leaf * view_.vectors * lane_count + member];
+        for (std::size_t piece = 0; piece < pieces(); ++piece) {
+            sum += partial_[piece * view_.vectors * lane_count + member];
         }
         return sum;
     }
@@ -288,35 +245,19 @@ class Group {
     }
 
   private:
-    std::size_t leaves_from(std::size_t leaf) const {
-        return std::min(leaves_of_piece_, tree_.leaves - leaf);
-    }
-
-    std::size_t leaves_of_ball_piece() const {
-        return std::min(block_leaves * stride_, ball_leaves);
-    }
-
-    double* scratch() const {
-        thread_local std::vector<double> buffer;
-        buffer.resize((in_blocks() ? block_leaves * leaf_size * tree_.dimension : 0) +
-                      task_.settings->neighbors);
-        return buffer.data();
-    }
-
     const Task& task_;
     const PointTree& tree_;
-    std::size_t members_, leaves_of_piece_, stride_ = 1;
+    std::size_t members_, leaves_of_piece_;
     std::vector<double> weights_, block_weights_, node_weights_;
     std::vector<std::uint32_t> significant_, block_counts_, node_counts_, neighbors_;
     std::vector<double> partial_;
     std::vector<std::uint64_t> visited_;
-    std::vector<unsigned> open_;  // by leaf: points that need their balls
     PosteriorGroup view_{};
 };
 
 /// One posterior with many points, but few of all: a tree of its own.
 double own_tree_entropy(const Task& task, const double* weights, std::size_t survivors,
-                        double work_on_balls, std::uint64_t& visits) {
+                        std::uint64_t& visits) {
     std::vector<double> points, kept;
     points.reserve(survivors * task.dimension);
     kept.reserve(survivors);
@@ -332,18 +273,14 @@ double own_tree_entropy(const Task& task, const double* weights, std::size_t sur
     const PointTree tree(own.points, own.count, own.dimension);
     Group group(own, tree, {kept.data()}, {survivors});
     for (std::size_t piece = 0; piece < group.pieces(); ++piece) group.add_piece(piece);
-    if (group.in_blocks()) {
-        group.bound_balls(work_on_balls);
-        for (std::size_t piece = 0; piece < group.ball_pieces(); ++piece) group.add_balls(piece);
-    }
     visits += group.visits();
     return group.entropy(0);
 }
 
 }  // namespace
 
-double use_ball_work(double nanoseconds) {
-    return std::exchange(most_ball_work, nanoseconds);
+std::size_t use_blocks_beyond(std::size_t points) {
+    return by_leaves_up_to.exchange(points);
 }
 
 void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSource& source,
@@ -421,12 +358,6 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
                 work_alone += cost_alone(s);
             }
         }
-        // Each tree's part.
-        std::size_t trees_of_set = (grouped.size() + max_group_lanes - 1) / max_group_lanes;
-        for (const std::size_t i : alone) trees_of_set += survivors[i] > exact_up_to ? 1 : 0;
-        const double work_on_balls =
-            most_ball_work * static_cast<double>(number) / static_cast<double>(posteriors) /
-            static_cast<double>(std::max<std::size_t>(1, sets.number * trees_of_set));
         if (shared) {
             prior_entropies(sets, weights.data(), number, settings, constants, values.data());
             counts.visits += sets.number * count * count;
@@ -452,8 +383,8 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
                     values[at] =
                         settings.offset + compact_entropy(task, w, survivors[i], visits[at]);
                 } else {
-                    values[at] = settings.offset +
-                                 own_tree_entropy(task, w, survivors[i], work_on_balls, visits[at]);
+                    values[at] =
+                        settings.offset + own_tree_entropy(task, w, survivors[i], visits[at]);
                 }
             });
         for (const std::uint64_t v : visits) counts.visits += v;
@@ -483,21 +414,6 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
                 parallel_for(
                     here * pieces, threads_for(work, here * pieces, settings.threads),
                     [&](std::size_t piece) { shared[piece / pieces]->add_piece(piece % pieces); });
-                if (shared[0]->in_blocks()) {
-                    parallel_for(here, threads_for(work, here, settings.threads),
-                                 [&](std::size_t h) { shared[h]->bound_balls(work_on_balls); });
-                    std::vector<std::pair<std::size_t, std::size_t>> of_balls;  // set, piece
-                    for (std::size_t h = 0; h < here; ++h) {
-                        for (std::size_t piece = 0; piece < shared[h]->ball_pieces(); ++piece) {
-                            of_balls.emplace_back(h, piece);
-                        }
-                    }
-                    parallel_for(of_balls.size(),
-                                 threads_for(work, of_balls.size(), settings.threads),
-                                 [&](std::size_t i) {
-                                     shared[of_balls[i].first]->add_balls(of_balls[i].second);
-                                 });
-                }
                 for (std::size_t h = 0; h < here; ++h) {
                     counts.visits += shared[h]->visits();
                     for (std::size_t g = begin; g < end; ++g) {

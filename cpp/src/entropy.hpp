@@ -74,8 +74,8 @@ struct PointSets {
 void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSource& source,
                const EntropySettings& settings, double* out, EntropyCounts& counts);
 
-/// Sets the nanoseconds of one thread that the nearest neighbours of many points may take, about,
-/// before one point stands for several; returns what they were. For tests.
-double use_ball_work(double nanoseconds);
+/// Sets the points of a tree beyond which its leaves are taken in blocks; returns how many there
+/// were. For tests.
+std::size_t use_blocks_beyond(std::size_t points);
 
 }  // namespace holdfast

@@ -16,9 +16,8 @@ namespace holdfast {
 
 /// The widest row of posteriors handled at once: 4 x 8.
 inline constexpr std::size_t max_group_lanes = 32;
-/// Leaves that block_lists and block_cuts take at once, and block_balls.
+/// The most leaves that block_nearest takes at once.
 inline constexpr std::size_t block_leaves = 16;
-inline constexpr std::size_t ball_leaves = 8 * block_leaves;
 
 /// Everything that a hypothetical observation's posterior is made of.
 struct PosteriorInput {
@@ -126,20 +125,10 @@ struct VectorKernels {
     /// `scratch` holds as many doubles as the largest k.
     void (*group_nearest)(const PosteriorGroup&, std::size_t leaf, const NearestNeighborConstants&,
                           double* scratch, double* out, std::uint64_t* visits);
-    /// The same for `leaves` leaves from `first` on, in two steps: to out[leaves][vectors * 8] the
-    /// terms that lists of near points settle, and to open[leaves] a bit for each point that needs
-    /// the sums over its ball;
-    void (*block_lists)(const PosteriorGroup&, std::size_t first, std::size_t leaves,
-                        const NearestNeighborConstants&, double* scratch, double* out,
-                        unsigned* open, std::uint64_t* visits);
-    /// and to out[vectors * 8] the terms of those, of which one stands for up to `stride`, a power
-    /// of two. `scratch` holds block_leaves * leaf_size points and the largest k.
-    void (*block_balls)(const PosteriorGroup&, std::size_t first, std::size_t leaves,
-                        const unsigned* open, std::size_t stride, const NearestNeighborConstants&,
-                        double* scratch, double* out, std::uint64_t* visits);
-    /// About how many leaves the balls around the open points cut, one by one.
-    std::uint64_t (*block_cuts)(const PosteriorGroup&, std::size_t first, std::size_t leaves,
-                                const unsigned* open, double resolution);
+    /// The same for `leaves` leaves from `first` on.
+    void (*block_nearest)(const PosteriorGroup&, std::size_t first, std::size_t leaves,
+                          const NearestNeighborConstants&, double* scratch, double* out,
+                          std::uint64_t* visits);
     void (*group_mixture)(const PosteriorGroup&, std::size_t leaf, double exponent, double* out,
                           std::uint64_t* visits);
     /// The terms of the points [begin, end) of a prior; see lanes/prior_block.hpp.

@@ -1,8 +1,9 @@
-"""Nearest neighbours of many points: blocks of leaves, and points that stand for several.
+"""Nearest neighbours of many points, where the kernel takes the leaves of its tree in blocks.
 
-Up to 4,096 points the kernel takes the leaves of its tree one by one (test_entropy_reference.py),
-beyond them in blocks. With more than 16,384 points the work on dense points can have a bound, where
-neighbours share a term; only ``use_ball_work`` sets it.
+It does so in trees of more than 16,384 points. A belief of as many particles or fewer has no such
+tree, so its decisions keep the bits that they had before there were blocks. Here
+``use_blocks_beyond`` lets small trees be taken in blocks as well, whose entropies the reference
+gives in a short time.
 """
 
 from __future__ import annotations
@@ -11,14 +12,15 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from tests.oracles import test_entropy_reference as small
 from tests.oracles.reference_entropy import nearest_neighbor_entropy
-from tests.oracles.test_entropy_reference import TOLERANCE, Ways, draw_weights, find
+from tests.oracles.test_entropy_reference import TOLERANCE, WAYS, Ways, draw_weights, find
 
 from holdfast import _kernel
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.estimators import NearestNeighbor
 
-COUNT = 4500
+LIMIT = 16_384
 
 
 def draw_belief(kind: str, count: int, dimension: int) -> FloatArray:
@@ -39,13 +41,18 @@ def draw_belief(kind: str, count: int, dimension: int) -> FloatArray:
 
 
 @pytest.fixture
-def usual_work() -> Iterator[None]:
-    usual = _kernel.use_ball_work(np.inf)
+def usual_limit() -> Iterator[None]:
+    assert _kernel.use_blocks_beyond(LIMIT) == LIMIT
     yield
-    _kernel.use_ball_work(usual)
+    _kernel.use_blocks_beyond(LIMIT)
 
 
-@pytest.mark.parametrize("posteriors", [1, 9, 27])
+@pytest.fixture
+def in_blocks(usual_limit: None) -> None:
+    _kernel.use_blocks_beyond(0)
+
+
+@pytest.mark.parametrize("posteriors", [1, 9, 17, 27])
 @pytest.mark.parametrize(
     ("kind", "dimension", "resolution"),
     [
@@ -58,47 +65,73 @@ def usual_work() -> Iterator[None]:
     ],
 )
 def test_blocks_against_the_reference(
-    kind: str, dimension: int, resolution: float, posteriors: int
+    kind: str, dimension: int, resolution: float, posteriors: int, in_blocks: None
 ) -> None:
-    points = draw_belief(kind, COUNT, dimension)
+    """Twelve blocks of 256 points, the last of them not full."""
+    count = 2900
+    points = draw_belief(kind, count, dimension)
     rng = np.random.default_rng([8, posteriors])
-    weights = draw_weights(rng, "similar", posteriors, COUNT, COUNT - 200)
+    weights = draw_weights(rng, "similar", posteriors, count, count - 200)
     found = find(points, weights, NearestNeighbor(5, resolution))
     assert found.ways == (Ways(own_tree=1) if posteriors == 1 else Ways(grouped=posteriors))
     expected = nearest_neighbor_entropy(points, weights[-1], 5, resolution)
     assert abs(found.entropies[-1] - expected) <= TOLERANCE
 
 
-@pytest.mark.parametrize("kind", ["spread", "heavy tails", "two clusters"])
-def test_points_that_stand_for_several(kind: str, usual_work: None) -> None:
-    """Less work, and entropies within a fiftieth of a nat. Up to 16,384 points all are exact."""
-    points = draw_belief(kind, 20_000, 3)
-    centres = np.random.default_rng(9).normal(size=(12, 1, 3))
-    weights = np.exp(-0.5 * ((points - centres) ** 2 / [0.3, 0.5, 4.0]).sum(axis=2))
-    for count in (20_000, 16_384):
+@pytest.mark.parametrize("neighbors", [1, 8, 9, 30])
+@pytest.mark.parametrize("way", [way for way in WAYS if not way.startswith("pair by pair")])
+def test_every_way_in_blocks(way: str, neighbors: int, in_blocks: None) -> None:
+    small.test_every_way(way, neighbors)
+
+
+@pytest.mark.parametrize(
+    "kind", ["spread", "grid", "line", "half at rest", "clusters", "one place"]
+)
+def test_ties_in_blocks(kind: str, in_blocks: None) -> None:
+    small.test_ties_and_numbers_of_neighbours(kind, 5)
+
+
+@pytest.mark.parametrize("posteriors", [1, 33])
+def test_a_point_among_its_copies_in_blocks(posteriors: int, in_blocks: None) -> None:
+    small.test_a_point_among_its_copies(posteriors)
+
+
+@pytest.mark.parametrize("posteriors", [1, 9])
+def test_more_points_than_short_counts_hold(posteriors: int, usual_limit: None) -> None:
+    """Counts have 16 bits until they are added up. Some balls of a leaf hold 65,546 copies of a
+    point, in leaves that are taken one by one since other balls of the same leaf hold none."""
+    points = np.concatenate([np.linspace(0.0, 0.5, 16), np.full(2**16 + 10, 1.2)]).reshape(-1, 1)
+    weights = np.random.default_rng(11).uniform(0.5, 1.0, size=(posteriors, len(points)))
+    weights[:, :16] *= 1e4
+    found = find(points, weights, NearestNeighbor(5, 1.0))
+    _kernel.use_blocks_beyond(len(points))
+    expected = find(points, weights, NearestNeighbor(5, 1.0))
+    assert np.abs(found.entropies - expected.entropies).max() <= TOLERANCE
+
+
+@pytest.mark.parametrize("posteriors", [1, 9])
+def test_blocks_begin_beyond_the_limit(posteriors: int, usual_limit: None) -> None:
+    """Up to it every bit is that of leaf by leaf; beyond it some of nearest neighbours differ."""
+    points = draw_belief("spread", LIMIT + 1, 3)
+    weights = draw_weights(np.random.default_rng(12), "similar", posteriors, LIMIT + 1, LIMIT + 1)
+    for count in (LIMIT, LIMIT + 1):
         few, part = points[:count], weights[:, :count]
-        _kernel.use_ball_work(np.inf)
-        exact = find(few, part, NearestNeighbor(5, 1.0))
-        _kernel.use_ball_work(2e7)
-        found = find(few, part, NearestNeighbor(5, 1.0))
-        error = np.abs(found.entropies - exact.entropies).max()
-        assert found.ways == exact.ways
-        if count == 20_000:
-            assert 0.0 < error < 0.02
-            assert found.visits < exact.visits
-        else:
-            assert error == 0.0
+        usual = find(few, part, NearestNeighbor(5, 0.3))
+        _kernel.use_blocks_beyond(count)
+        by_leaves = find(few, part, NearestNeighbor(5, 0.3))
+        _kernel.use_blocks_beyond(LIMIT)
+        assert np.allclose(usual.entropies, by_leaves.entropies, rtol=0.0, atol=TOLERANCE)
+        same = usual.entropies.tobytes() == by_leaves.entropies.tobytes()
+        assert same == (count == LIMIT)
 
 
-@pytest.mark.parametrize("work", [np.inf, 1e6])
-def test_threads_change_no_bit(work: float, usual_work: None) -> None:
-    count = 20_000
+def test_threads_change_no_bit(in_blocks: None) -> None:
+    count = 5000
     points = draw_belief("spread", 2 * count, 3)
     weights = np.abs(np.random.default_rng(10).normal(size=(9, count)))
     weights[7:, count // 3 :] = 0.0  # a tree of their own
-    weights[8, 5000:] = 0.0
+    weights[8, count // 10 :] = 0.0
     before = _kernel.use_threads_from(0.0)
-    _kernel.use_ball_work(work)
     try:
         results = {
             _kernel.entropies(

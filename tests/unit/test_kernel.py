@@ -103,6 +103,13 @@ for count, dimension, kept, posteriors, way in (
         if ways[way] != posteriors:
             wrong_ways.append(name)
 
+    usual = kernel.use_blocks_beyond(0)
+    for resolution in (1e-9, 0.2, 2.0):
+        result, _, visits, _ = kernel.entropies(
+            points, normals * 0.4, True, 0, 5, resolution, 0.0, 0.0, 2, *alone)
+        note(f"blocks {count} {dimension} {kept} {resolution}", result, np.array(visits))
+    kernel.use_blocks_beyond(usual)
+
     result, *_ = kernel.entropies(points, normals, True, 2, 1, 1.0, 0.0, 0.0, 2, *alone)
     note(f"variance {count} {dimension} {kept}", result)
     prior = np.full(count, 1.0 / count)

@@ -164,47 +164,47 @@ struct BlockSums {
     }
 };
 
-/// Points whose balls are summed, sixteen beside each other as in a leaf of the tree.
+/// Leaves of the tree, from `first` on, with points whose balls are summed.
 struct BlockQueries {
-    std::size_t number;
-    double* coordinates;  // [block_leaves][dimension][leaf_size]
+    std::size_t first;
+    std::uint32_t nodes[block_leaves];
+    unsigned open[block_leaves];  // bits: these points
 };
 
-/// Boxes beside each other.
-struct BlockBoxes {
-    Lanes low[max_dimension][block_vectors], high[max_dimension][block_vectors];
-};
-
-/// Appends which points of leaf `at` of the tree lie within the balls around sixteen queries.
-static void cut_leaf(const TreeView& tree, const double* queries, std::size_t first_point,
-                     unsigned used, std::uint32_t at, double radius_squared, Cut*& cut,
-                     std::uint16_t*& around, std::uint64_t* visits) {
+/// Appends which points of leaf `at` of the tree lie within the balls around the open points of a
+/// leaf of the block.
+static void cut_leaf(const TreeView& tree, const BlockQueries& queries, std::size_t place,
+                     std::uint32_t at, double radius_squared, Cut*& cut, std::uint16_t*& around,
+                     std::uint64_t* visits) {
+    const std::size_t leaf = queries.first + place;
     unsigned inside = 0, reached = 0;
     for (std::size_t v = 0; v < query_vectors; ++v) {
-        const PointDistances to_box = distances_to_box(tree, queries + v * lane_count, at);
+        const PointDistances to_box = point_distances(tree, leaf, v, at);
         inside |= bits_of(to_box.greatest <= radius_squared) << (v * lane_count);
         reached |= bits_of(to_box.least <= radius_squared) << (v * lane_count);
     }
-    for (unsigned left = inside & used; left != 0; left &= left - 1) {
+    const std::size_t first_point = place * leaf_size, size = tree.dimension * leaf_size;
+    const double* queries_at = tree.coordinates + leaf * size;
+    const double* points = tree.coordinates + tree.nodes[at].first_leaf * size;
+    for (unsigned left = inside & queries.open[place]; left != 0; left &= left - 1) {
         *around++ =
             static_cast<std::uint16_t>(first_point + static_cast<std::size_t>(__builtin_ctz(left)));
         ++*visits;
     }
-    const double* points =
-        tree.coordinates + tree.nodes[at].first_leaf * tree.dimension * leaf_size;
-    for (reached &= used & ~inside; reached != 0; reached &= reached - 1) {
+    for (reached &= queries.open[place] & ~inside; reached != 0; reached &= reached - 1) {
         const auto i = static_cast<std::size_t>(__builtin_ctz(reached));
-        Lanes distance[leaf_size / lane_count] = {};
+        Lanes distance[query_vectors] = {};
         for (std::size_t c = 0; c < tree.dimension; ++c) {
-            const Lanes own = splat(queries[c * leaf_size + i]);
-            for (std::size_t block = 0; block < leaf_size / lane_count; ++block) {
-                const Lanes difference = load(points + c * leaf_size + block * lane_count) - own;
-                distance[block] += difference * difference;
+            const double* x = points + c * leaf_size;
+            const double own = queries_at[c * leaf_size + i];
+            for (std::size_t v = 0; v < query_vectors; ++v) {
+                const Lanes difference = load(x + v * lane_count) - own;
+                distance[v] += difference * difference;
             }
         }
         unsigned subset = 0;
-        for (std::size_t block = 0; block < leaf_size / lane_count; ++block) {
-            subset |= bits_of(distance[block] <= radius_squared) << (block * lane_count);
+        for (std::size_t v = 0; v < query_vectors; ++v) {
+            subset |= bits_of(distance[v] <= radius_squared) << (v * lane_count);
         }
         *cut = {static_cast<std::uint16_t>(first_point + i), static_cast<std::uint16_t>(subset)};
         cut += subset != 0 ? 1 : 0;
@@ -212,13 +212,23 @@ static void cut_leaf(const TreeView& tree, const double* queries, std::size_t fi
     }
 }
 
-/// Walks through the tree for the balls around all points of the boxes `all` (bits):
-/// `inside(node, boxes)` for nodes that lie within the balls around every point of these boxes,
-/// `cut(node, boxes)` for leaves that some of their balls may cut.
-template <class Inside, class Cutting>
-HOLDFAST_INLINE void walk_block(const TreeView& tree, const BlockBoxes& boxes, unsigned all,
-                                double radius_squared, const Inside& inside,
-                                const Cutting& cutting) {
+/// Weights and numbers of all points (an open point itself, too) within the resolution.
+template <std::size_t vectors>
+static void sum_block(const PosteriorGroup& group, const BlockQueries& queries,
+                      double radius_squared, BlockSums<vectors>& sums, std::uint64_t* visits) {
+    constexpr std::size_t columns = vectors * lane_count;
+    const TreeView& tree = group.tree;
+    sums.clear();
+    Lanes low[max_dimension][block_vectors], high[max_dimension][block_vectors];
+    unsigned all = 0;
+    for (std::size_t place = 0; place < block_leaves; ++place) {
+        if (queries.open[place] != 0) all |= 1u << place;
+        for (std::size_t c = 0; c < tree.dimension; ++c) {
+            const std::size_t limit = queries.nodes[place] * tree.dimension + c;
+            low[c][place / lane_count][place % lane_count] = tree.low[limit];
+            high[c][place / lane_count][place % lane_count] = tree.high[limit];
+        }
+    }
     struct Pending {
         std::uint32_t node;
         unsigned open;  // leaves of the block with balls that the node may cut
@@ -233,11 +243,10 @@ HOLDFAST_INLINE void walk_block(const TreeView& tree, const BlockBoxes& boxes, u
             for (std::size_t c = 0; c < tree.dimension; ++c) {
                 const double node_low = tree.low[at * tree.dimension + c],
                              node_high = tree.high[at * tree.dimension + c];
-                const Lanes low = boxes.low[c][v], high = boxes.high[c][v];
-                const Lanes gap_1 = node_low - high, gap_2 = low - node_high;
+                const Lanes gap_1 = node_low - high[c][v], gap_2 = low[c][v] - node_high;
                 Lanes gap = select(gap_1 > gap_2, gap_1, gap_2);
                 gap = select(gap > 0.0, gap, Lanes{});
-                const Lanes span_1 = node_high - low, span_2 = high - node_low;
+                const Lanes span_1 = node_high - low[c][v], span_2 = high[c][v] - node_low;
                 const Lanes span = select(span_1 > span_2, span_1, span_2);
                 least += gap * gap;
                 greatest += span * span;
@@ -246,112 +255,37 @@ HOLDFAST_INLINE void walk_block(const TreeView& tree, const BlockBoxes& boxes, u
             contained |= bits_of(greatest <= radius_squared) << (v * lane_count);
         }
         open &= open_above;
-        contained &= open;
-        if (contained != 0) inside(at, contained);
+        for (unsigned left = open & contained; left != 0; left &= left - 1) {
+            sums.shared[__builtin_ctz(left)].add(group.node_weights + at * columns,
+                                                 group.node_counts + at * columns);
+            ++*visits;
+        }
         open &= ~contained;
         if (open == 0) continue;
         const TreeNode& node = tree.nodes[at];
         if (node.left != 0) {
             stack[depth++] = {node.right, open};
             stack[depth++] = {node.left, open};
-        } else {
-            cutting(at, open);
+            continue;
         }
-    }
-}
-
-/// Weights and numbers of all points (a query itself, too) within the resolution.
-template <std::size_t vectors>
-static void sum_block(const PosteriorGroup& group, const BlockQueries& queries,
-                      double radius_squared, BlockSums<vectors>& sums, std::uint64_t* visits) {
-    constexpr std::size_t columns = vectors * lane_count;
-    const TreeView& tree = group.tree;
-    sums.clear();
-    BlockBoxes boxes;
-    unsigned all = 0, used[block_leaves];
-    for (std::size_t place = 0; place < block_leaves; ++place) {
-        const std::size_t before = place * leaf_size, v = place / lane_count;
-        const std::size_t after = queries.number > before ? queries.number - before : 0;
-        const std::size_t here = after < leaf_size ? after : leaf_size;
-        used[place] = (1u << here) - 1;
-        if (here > 0) all |= 1u << place;
-        for (std::size_t c = 0; c < tree.dimension; ++c) {
-            const double* x = queries.coordinates + (place * tree.dimension + c) * leaf_size;
-            double low = __builtin_inf(), high = -__builtin_inf();
-            for (std::size_t i = 0; i < here; ++i) {
-                low = x[i] < low ? x[i] : low;
-                high = x[i] > high ? x[i] : high;
-            }
-            boxes.low[c][v][place % lane_count] = low;
-            boxes.high[c][v][place % lane_count] = high;
+        const std::size_t number = sums.waiting++;
+        Cut* cut = sums.cuts + sums.first_cut[number];
+        std::uint16_t* around = sums.around + sums.first_around[number];
+        for (std::size_t line = 0; line < leaf_size * vectors; ++line) {
+            __builtin_prefetch(group.weights + node.first_leaf * leaf_size * columns +
+                               line * lane_count);
         }
+        for (; open != 0; open &= open - 1) {
+            cut_leaf(tree, queries, static_cast<std::size_t>(__builtin_ctz(open)), at,
+                     radius_squared, cut, around, visits);
+        }
+        sums.waiting_leaf[number] = node.first_leaf;
+        sums.first_cut[number + 1] = static_cast<std::size_t>(cut - sums.cuts);
+        sums.first_around[number + 1] = static_cast<std::size_t>(around - sums.around);
+        if (sums.waiting == waiting_leaves) sums.add_waiting(group);
     }
-    walk_block(
-        tree, boxes, all, radius_squared,
-        [&](std::uint32_t at, unsigned places) HOLDFAST_LAMBDA {
-            for (; places != 0; places &= places - 1) {
-                sums.shared[__builtin_ctz(places)].add(group.node_weights + at * columns,
-                                                       group.node_counts + at * columns);
-                ++*visits;
-            }
-        },
-        [&](std::uint32_t at, unsigned places) HOLDFAST_LAMBDA {
-            const std::size_t leaf = tree.nodes[at].first_leaf, number = sums.waiting;
-            Cut* cut = sums.cuts + sums.first_cut[number];
-            std::uint16_t* around = sums.around + sums.first_around[number];
-            for (std::size_t line = 0; line < leaf_size * vectors; ++line) {
-                __builtin_prefetch(group.weights + leaf * leaf_size * columns + line * lane_count);
-            }
-            for (; places != 0; places &= places - 1) {
-                const auto place = static_cast<std::size_t>(__builtin_ctz(places));
-                cut_leaf(tree, queries.coordinates + place * tree.dimension * leaf_size,
-                         place * leaf_size, used[place], at, radius_squared, cut, around, visits);
-            }
-            sums.waiting_leaf[number] = static_cast<std::uint32_t>(leaf);
-            sums.first_cut[number + 1] = static_cast<std::size_t>(cut - sums.cuts);
-            sums.first_around[number + 1] = static_cast<std::size_t>(around - sums.around);
-            sums.waiting = number + 1;
-            if (sums.waiting == waiting_leaves) sums.add_waiting(group);
-        });
     sums.add_waiting(group);
     sums.take_recent();
-}
-
-static std::uint32_t node_of_leaf(const TreeView& tree, std::size_t leaf) {
-    std::uint32_t at = 0;
-    while (tree.nodes[at].left != 0) {
-        const TreeNode& node = tree.nodes[at];
-        at = leaf < tree.nodes[node.left].last_leaf ? node.left : node.right;
-    }
-    return at;
-}
-
-/// About how many leaves of the tree the balls around the points `open` of some leaves cut.
-static std::uint64_t block_cuts(const PosteriorGroup& group, std::size_t first, std::size_t leaves,
-                                const unsigned* open, double resolution) {
-    const TreeView& tree = group.tree;
-    BlockBoxes boxes;
-    unsigned all = 0;
-    for (std::size_t place = 0; place < leaves; ++place) {
-        if (open[place] == 0) continue;
-        all |= 1u << place;
-        const std::size_t node = node_of_leaf(tree, first + place);
-        const std::size_t v = place / lane_count, lane = place % lane_count;
-        for (std::size_t c = 0; c < tree.dimension; ++c) {
-            boxes.low[c][v][lane] = tree.low[node * tree.dimension + c];
-            boxes.high[c][v][lane] = tree.high[node * tree.dimension + c];
-        }
-    }
-    std::uint64_t total = 0;
-    walk_block(
-        tree, boxes, all, resolution * resolution * tie_tolerance,
-        [](std::uint32_t, unsigned) HOLDFAST_LAMBDA {},
-        [&](std::uint32_t, unsigned places) HOLDFAST_LAMBDA {
-            for (; places != 0; places &= places - 1) {
-                total += static_cast<unsigned>(__builtin_popcount(open[__builtin_ctz(places)]));
-            }
-        });
-    return total;
 }
 
 }  // namespace holdfast::inline HOLDFAST_ISA

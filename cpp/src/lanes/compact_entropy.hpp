@@ -21,19 +21,12 @@ HOLDFAST_INLINE void insert_smallest(double* smallest, std::uint32_t& kept, std:
 /// Otherwise points on a grid would be in or out of a ball by the accident of their last bit.
 inline constexpr double tie_tolerance = 1.0 + 0x1p-40;
 
-/// Of one point: -log(m / (1 - w)) + log c_d + d log r + log q - psi(q).
-HOLDFAST_INLINE double nearest_value(double weight, double mass, double log_radius,
-                                     std::size_t dimension, std::uint32_t within,
-                                     const NearestNeighborConstants& constants) {
-    return constants.log_ball_volume + static_cast<double>(dimension) * log_radius -
-           log_of(mass / (1.0 - weight)) + constants.bias_correction[within];
-}
-
-/// Its term: w times that.
+/// The term of one point: w (-log(m / (1 - w)) + log c_d + d log r + log q - psi(q)).
 HOLDFAST_INLINE double nearest_term(double weight, double mass, double log_radius,
                                     std::size_t dimension, std::uint32_t within,
                                     const NearestNeighborConstants& constants) {
-    return weight * nearest_value(weight, mass, log_radius, dimension, within, constants);
+    return weight * (constants.log_ball_volume + static_cast<double>(dimension) * log_radius -
+                     log_of(mass / (1.0 - weight)) + constants.bias_correction[within]);
 }
 
 /// The k of the settings, unless it is changed: its least values stay in registers.

@@ -20,8 +20,8 @@ const VectorKernels table = {
     HOLDFAST_ISA_NAME, exp_array,       log_array,     sin_array,     cos_array,
     normals_array,     normals_of_each, substreams,    discs_collide, rectangles_collide,
     sum_array,         weighted_sum,    weighted_sums, posterior,     normalize,
-    compact_nearest,   compact_mixture, group_nearest, block_lists,   block_balls,
-    block_cuts,        group_mixture,   prior_block,
+    compact_nearest,   compact_mixture, group_nearest, block_nearest, group_mixture,
+    prior_block,
 };
 
 }  // namespace holdfast::inline HOLDFAST_ISA

@@ -53,12 +53,12 @@ struct PointDistances {
     Lanes least, greatest;
 };
 
-/// `points` has their coordinates, each leaf_size after the one before.
-HOLDFAST_INLINE PointDistances distances_to_box(const TreeView& tree, const double* points,
-                                                std::size_t node) {
+HOLDFAST_INLINE PointDistances point_distances(const TreeView& tree, std::size_t leaf,
+                                               std::size_t v, std::size_t node) {
     PointDistances result{};
     for (std::size_t c = 0; c < tree.dimension; ++c) {
-        const Lanes x = load(points + c * leaf_size);
+        const Lanes x =
+            load(tree.coordinates + (leaf * tree.dimension + c) * leaf_size + v * lane_count);
         const Lanes from_low = x - tree.low[node * tree.dimension + c];
         const Lanes to_high = tree.high[node * tree.dimension + c] - x;
         Lanes span = from_low, gap = -to_high;
@@ -70,12 +70,6 @@ HOLDFAST_INLINE PointDistances distances_to_box(const TreeView& tree, const doub
         result.greatest += span * span;
     }
     return result;
-}
-
-HOLDFAST_INLINE PointDistances point_distances(const TreeView& tree, std::size_t leaf,
-                                               std::size_t v, std::size_t node) {
-    return distances_to_box(
-        tree, tree.coordinates + leaf * tree.dimension * leaf_size + v * lane_count, node);
 }
 
 /// Squared distances from a point to eight slots of a leaf.

@@ -103,10 +103,11 @@ static Within within_radius(const PosteriorGroup& group, const double* point, st
     return found;
 }
 
-/// What the weight of a point under one posterior is multiplied with.
-static double searched_value(const PosteriorGroup& group, const double* point, std::size_t slot,
-                             std::size_t column, const NearestNeighborConstants& constants,
-                             double* scratch, std::uint64_t* visits) {
+/// One point under one posterior, by searching the tree: right for every point, and the slowest
+/// way.
+static double searched_term(const PosteriorGroup& group, const double* point, std::size_t slot,
+                            std::size_t column, const NearestNeighborConstants& constants,
+                            double* scratch, std::uint64_t* visits) {
     const std::uint32_t neighbors = group.neighbors[column];
     const double resolution_squared = constants.resolution * constants.resolution * tie_tolerance;
     const double weight = group.weights[slot * group.vectors * lane_count + column];
@@ -114,17 +115,8 @@ static double searched_value(const PosteriorGroup& group, const double* point, s
     const bool resolved = radius_squared > resolution_squared;
     radius_squared = resolved ? radius_squared * tie_tolerance : resolution_squared;
     const Within found = within_radius(group, point, slot, column, radius_squared, visits);
-    return nearest_value(weight, found.mass, 0.5 * log_of(radius_squared), group.tree.dimension,
-                         resolved ? neighbors : found.count, constants);
-}
-
-/// One point under one posterior, by searching the tree: right for every point, and the slowest
-/// way.
-static double searched_term(const PosteriorGroup& group, const double* point, std::size_t slot,
-                            std::size_t column, const NearestNeighborConstants& constants,
-                            double* scratch, std::uint64_t* visits) {
-    return group.weights[slot * group.vectors * lane_count + column] *
-           searched_value(group, point, slot, column, constants, scratch, visits);
+    return nearest_term(weight, found.mass, 0.5 * log_of(radius_squared), group.tree.dimension,
+                        resolved ? neighbors : found.count, constants);
 }
 
 }  // namespace holdfast::inline HOLDFAST_ISA
