@@ -10,6 +10,7 @@ from tests.unit.test_protocol_service import Bench, Robot, content, planning_of
 
 from holdfast.planning.planner import digest
 from holdfast.protocol.decision_cost import Cost
+from holdfast.protocol.messages import Refused
 from holdfast.protocol.service_batches import run_together
 from holdfast.protocol.service_jobs import Job, JobResult
 from holdfast.protocol.service_sessions import SHORT_S
@@ -117,3 +118,18 @@ def test_what_is_known_of_newcomers() -> None:
 
 def is_short(job: Job) -> bool:
     return job.interruption.most_s <= 5.0 * SHORT_S
+
+
+def test_who_is_refused_is_computed_on_a_thread_next() -> None:
+    """Else each of its requests would have others computed twice."""
+    bench, (robot,) = jobs_of(1)
+    bench.run_all()
+    robot.act_until_sensing()
+    robot.sense()
+    wrong = msgspec.structs.replace(robot.observed[-1], observation=bytes(8))
+    (reply,) = bench.ask(robot.request(inputs=(wrong,)))
+    assert isinstance(reply, Refused)
+    call = bench.send(robot.request(since=len(robot.observed) - 1))
+    assert not is_short(bench.jobs[0])
+    bench.run_all()
+    assert content(bench.replies[call]) == robot.right_answer()

@@ -526,6 +526,21 @@ async def test_what_has_arrived_is_heard_before_the_next_brief_job() -> None:
     assert set(threads) == {threading.current_thread()}
 
 
+async def test_jobs_that_cannot_be_computed_together_have_a_turn_each() -> None:
+    """Else a service would say nothing while each of them uses up its time."""
+    machine, both = scripted(*[("same", 1e-4, lambda: None)] * 3)
+    for run in machine.runs:
+        run.job.company = b"equal"
+    await both.start()
+    both.deliver(Call(machine.trace))
+    numbers = {0}
+    while 3 not in numbers:
+        await asyncio.sleep(0)
+        numbers.add(machine.trace.count("finished same"))
+    assert numbers == {0, 1, 2, 3}
+    await both.close()
+
+
 async def test_long_jobs_run_beside_each_other_and_beside_the_loop() -> None:
     meeting = threading.Barrier(3, timeout=PATIENCE_S)
     machine, both = scripted(("one", math.inf, meeting.wait), ("two", math.inf, meeting.wait))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from holdfast.config.registry import BUILT_IN, problem_class
-from holdfast.errors import ProblemError
+from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.planning.planner import Planner, PlanningState, digest
 from holdfast.planning.settings import Method, PlanningSettings
 from holdfast.planning.together import (
@@ -79,3 +79,14 @@ def test_what_goes_wrong_raises() -> None:
     states = [planner.observe(planner.init(5), 0, None)[0]] * 2
     with pytest.raises(ProblemError, match="not finite"):
         plan_together(planner, states, 1)
+
+
+@pytest.mark.parametrize("shown", [[0.1], [0.1, 0.1, 0.1], [np.nan, 0.1], [0.1, np.inf]])
+def test_observations_that_are_refused_alone(shown: list[float]) -> None:
+    planner = planner_of("capsule_robot")
+    observations = [np.array(shown)] * 2
+    states = [planner.init(seed) for seed in range(2)]
+    with pytest.raises(InvalidValueError):
+        planner.observe(states[0], 0, observations[0])
+    with pytest.raises(InvalidValueError):
+        observe_together(planner, states, [0, 0], observations)

@@ -230,7 +230,7 @@ def update(
     ProblemError
         If the problem violates its contract.
     """
-    observed = _finite(observation)
+    observed = finite(observation)
     if not has_general_observations(problem):
         mean, variance = checked.prediction(problem, belief.states, sensing_action)
         if mean.shape[-1] != observed.shape[0]:
@@ -289,13 +289,14 @@ def update_by_move(
     ``belief`` is the one after the move. Raises as :func:`update`, and ProblemError if the problem
     has no ``move_log_likelihood``.
     """
-    observed = _finite(observation)
+    observed = finite(observation)
     log_likelihood = checked.move_log_likelihood(problem, belief.states, task_action, observed)
     explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
     return _reweighted(belief, log_likelihood, explained, None, explained)
 
 
-def _finite(observation: npt.ArrayLike) -> FloatArray:
+def finite(observation: npt.ArrayLike) -> FloatArray:
+    """Return an observation as numbers; raise InvalidValueError if one is not finite."""
     observed = floats("observation", observation).reshape(-1)
     if not numerics.all_finite(observed):
         raise InvalidValueError(

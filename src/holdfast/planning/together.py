@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from holdfast import _kernel
-from holdfast.errors import ProblemError
+from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.numerics import reproducible as numerics
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.floating_mode import in_own_mode
@@ -27,6 +27,7 @@ from holdfast.planning.belief import (
     Belief,
     effective_sample_size,
     estimate,
+    finite,
     gaussian_log_likelihood,
     resample,
 )
@@ -80,7 +81,9 @@ def observe_together(
         weights = np.array([belief.weights for belief in beliefs])
         mean, variance = checked.prediction(problem, _stacked(beliefs), chosen)
         checked.require_usable(problem, chosen, mean, variance)
-        observed = np.array([[observations[row]] for row in rows])
+        observed = np.array([[finite(observations[row])] for row in rows])
+        if observed.shape[-1] != mean.shape[-1]:
+            raise InvalidValueError(f"observations that sensing action {action} does not give")
         angles = circular_observation(problem, chosen, mean.shape[-1])
         likelihoods, _ = gaussian_log_likelihood(observed, mean, variance, angles)
         log_weights = numerics.log(weights) + likelihoods

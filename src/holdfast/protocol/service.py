@@ -491,6 +491,9 @@ class Service:
         if outcome.diverged and request is not None:
             self._statistics.states_diverged += 1
             self._note("state_diverged", session, trial=request.trial, step=request.step)
+        if outcome.failure is not None:
+            # Together with others it would fail for all: the next one is on a thread.
+            task.expected_time.typical_s = math.inf
         for record in self._calls.detach(task):
             if outcome.failure is None:
                 self._calls.send_need_state(

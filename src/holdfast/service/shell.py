@@ -265,10 +265,18 @@ class ServiceShell:
         found = run_together(jobs)
         computed_s, processor_s = self._loop.time() - began, time.thread_time() - used_s
         for job in jobs:
-            if (outcome := found.get(job)) is None:
+            if (outcome := found.get(job)) is not None:
+                self._finished(job, outcome, computed_s / len(found), processor_s / len(found))
+            elif len(jobs) == 1:
                 self._finished(job, *self._computed(job))
             else:
-                self._finished(job, outcome, computed_s / len(found), processor_s / len(found))
+                job.company = None  # alone, in a turn of its own: each may take its full time
+                self._run_briefly(job)
+
+    def _run_briefly(self, job: Job) -> None:
+        self._brief_jobs.append(job)
+        if len(self._brief_jobs) == 1:
+            self._run_brief_jobs_soon()
 
     def _run_brief_jobs_soon(self) -> None:
         """Schedule the next brief jobs after all input that has arrived by then.
@@ -343,10 +351,8 @@ class ServiceShell:
                 functools.partial(self._computed, job),
                 lambda computed: self._guarded(self._finished, job, *computed),
             )
-            return
-        self._brief_jobs.append(job)
-        if len(self._brief_jobs) == 1:
-            self._run_brief_jobs_soon()
+        else:
+            self._run_briefly(job)
 
     def _set_timer(self) -> None:
         """Set the timer for the machine's or the log's next wake-up."""
