@@ -215,6 +215,19 @@ class TestManyFromOneAddress:
         assert begun.index(listener._network_of(socket.AF_INET, ("127.0.0.1", 1))) <= 1
         assert len(begun) == 400
 
+    async def test_of_many_addresses_those_that_came_first_stay(
+        self, tls: StreamWire, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(listener, "MAX_WAITING", 300)
+        monkeypatch.setattr(listener, "_network_of", lambda _, address: str(address).encode())
+        service = tls.service("cloud", "b1")
+        monkeypatch.setattr(service, "_may_shake_hands", lambda: False)
+        await service.start(echo)
+        with contextlib.ExitStack() as stack:
+            others = self.flood(stack, tls.endpoint("cloud"), b"\x16\x03\x01")
+            await self.until_closed(others, self.MANY - 300)
+            assert all(map(self.is_open, others[:200]))
+
     def test_an_owner_of_many_addresses_of_ipv6_is_one(self) -> None:
         def network(address: str) -> bytes:
             return listener._network_of(socket.AF_INET6, (address, 1, 0, 0))

@@ -153,8 +153,12 @@ class Listener:
             return
         self._waiting.setdefault(network, deque()).append(connection)
         if sum(map(len, self._waiting.values())) > MAX_WAITING:
-            # The newest of the network with the most: others have waited for longer.
-            max(self._waiting.values(), key=len).pop().close()
+            # The newest of the network with the most, of equals the last that came: others have
+            # waited for longer.
+            most = max(reversed(self._waiting), key=lambda each: len(self._waiting[each]))
+            self._waiting[most].pop().close()
+            if not self._waiting[most]:
+                del self._waiting[most]
         if self._delivery is None:
             self._deliver(have_waited=False)
 
@@ -167,11 +171,9 @@ class Listener:
         delivered = 0
         while self._waiting and delivered < _ACCEPTED_AT_ONCE and self._may_deliver():
             network, waiting = self._waiting.popitem(last=False)
-            connection = waiting.popleft() if waiting else None
+            connection = waiting.popleft()
             if waiting:
                 self._waiting[network] = waiting
-            if connection is None:
-                continue
             if have_waited and _has_hung_up(connection):
                 connection.close()
             else:
