@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,15 @@ def test_it_is_read_while_it_grows(tmp_path: Path) -> None:
 def test_it_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot be written"):
         EventTable(tmp_path / "missing" / "timings.csv", Timing)
+
+
+def test_a_full_disk(tmp_path: Path) -> None:
+    table = EventTable(tmp_path / "timings.csv", Timing)
+    with Path("/dev/full").open("wb") as full:
+        os.dup2(full.fileno(), table._file.fileno())
+    for act in (lambda: table.add(timing()), table.close):
+        with pytest.raises(OutputError, match="cannot be written: No space left"):
+            act()
 
 
 class TestCountVerified:

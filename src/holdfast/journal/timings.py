@@ -69,8 +69,17 @@ class EventTable:
         return OutputError(f"{self._path}: cannot be written: {error.strerror}")
 
     def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+        """Close the file.
+
+        Raises
+        ------
+        OutputError
+            If what an unwritable disk has left in its buffer cannot be written now, either.
+        """
+        try:
+            self._file.close()
+        except OSError as error:
+            raise self._unwritable(error) from error
 
 
 def _cut_off_unfinished_line(path: Path) -> None:

@@ -318,8 +318,12 @@ def check_method(inspection: Inspection) -> None:
         inspection.add_over("method")
         return
     difference, (low, high) = mean_difference(np.array(more))
-    verb, unit = ("loses", "of reward") if priced else ("takes", "steps (a failure: the limit)")
-    seen = f"{method} {verb} {difference:+.3g} [{low:+.3g}, {high:+.3g}] {unit} beside random "
+    words = "takes {:+.3g} [{:+.3g}, {:+.3g}] steps (a failure: the limit)"
+    shown = difference, low, high
+    if priced:
+        words = "earns {:+.3g} [{:+.3g}, {:+.3g}] of reward"
+        shown = -difference, -high, -low
+    seen = f"{method} {words.format(*shown)} beside random "
     seen += f"sensing in {count} paired trials: "
     if low > 0.0:
         advice = "Run holdfast tune, which finds what suits this problem. Of methods that are as "
