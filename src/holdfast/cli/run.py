@@ -198,7 +198,7 @@ def _run(options: RunOptions) -> int:
                 raise RunError(error, command, EXIT_REBOOTED) from error
             cannot_go_on = (
                 isinstance(error, UnknownPerformanceError | LostJournalError)
-                or directory.journal.unfinished_trial() is None
+                or directory.journal.is_empty()
             )
             resume = None if cannot_go_on else options.resume_command(directory_path)
             # Of two processes of one run each would end the other, were both started again.
