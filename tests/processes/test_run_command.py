@@ -280,7 +280,8 @@ class TestInterruption:
         held_run.wait_for_workers()
         os.kill(held_run.workers()[0], signal.SIGKILL)
         errors = held_run.end()
-        assert held_run.process.returncode == 2
+        assert held_run.process.returncode == 4
+        assert "Go on with: " in errors
         assert "Traceback" not in errors
         assert "a worker process was killed by SIGKILL while it ran trial " in errors
         kept = len(decided(workplace / "out"))
