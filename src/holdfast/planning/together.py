@@ -45,8 +45,6 @@ from holdfast.problems.attributes import (
     static_parameters,
 )
 
-__all__ = ["can_decide_together", "choose_together", "observe_together", "plan_together"]
-
 
 def can_decide_together(planner: Planner) -> bool:
     """Tell whether the bits of a problem's functions do not depend on what else is asked.
@@ -147,9 +145,8 @@ def choose_together(planner: Planner, states: Sequence[PlanningState]) -> list[i
     chosen = [0] * len(states)
     for stage, rows in _alike([state.stage for state in states]):
         beliefs = [states[row].belief for row in rows]
-        together = np.concatenate([belief.states for belief in beliefs])
-        together.setflags(write=False)
-        predictions = predict(problem, settings, together, stage)
+        together = _stacked(beliefs)
+        predictions = predict(problem, settings, together.reshape(-1, together.shape[-1]), stage)
         for number, (row, belief) in enumerate(zip(rows, beliefs, strict=True)):
             state, size = states[row], len(belief.weights)
             chosen[row], _ = choose_sensing_action(
