@@ -44,6 +44,8 @@ install: $(INSTALLED_DEV) $(INSTALLED_COMPILED) ## the environments, which the o
 
 # Each of the two processes imports what it finds, which takes as long as many of the tests.
 PYTEST := $(BIN)/pytest -q -n 2 --dist worksteal --ignore=tests/deploy --ignore=tests/ros
+# For one test that takes minutes: what takes longer hangs.
+LONG := -o faulthandler_timeout=2400
 
 test: $(INSTALLED_DEV) ## the quick tests
 	$(PYTEST) -m "not slow"
@@ -55,32 +57,32 @@ test-real: $(INSTALLED_DEV) ## those with real processes and sockets
 	$(PYTEST) -m "real and not slow"
 
 test-defects: $(INSTALLED_DEV) ## the simulator finds every defect that is planted: a minute
-	$(PYTEST) -m slow tests/simulation/test_defects.py
+	$(PYTEST) $(LONG) -m slow tests/simulation/test_defects.py
 
 test-slow: $(INSTALLED_DEV) ## what repeats them with more seeds, problems and moments: half an hour
-	$(PYTEST) -m slow
+	$(PYTEST) $(LONG) -m slow
 
 test-compiled: $(INSTALLED_COMPILED) ## the simulator's tests and 10,000 seeds through compiled machines
-	$(COMPILED)/bin/pytest -q -m "slow or not slow" tests/scenarios tests/simulation/test_world.py \
+	$(COMPILED)/bin/pytest -q $(LONG) -m "slow or not slow" tests/scenarios tests/simulation/test_world.py \
 	    tests/processes/test_compiled.py
 
 test-deploy: $(INSTALLED_DEV) ## images, tunnels and machines; root, and packages that .ci/run installs
-	$(BIN)/pytest -q -m "deploy and not slow" tests/deploy
+	$(BIN)/pytest -q $(LONG) -m "deploy and not slow" tests/deploy
 
 test-deploy-slow: $(INSTALLED_DEV) ## those of them that take minutes
-	$(BIN)/pytest -q -m "deploy and slow" tests/deploy
+	$(BIN)/pytest -q $(LONG) -m "deploy and slow" tests/deploy
 
 test-ros: $(INSTALLED_DEV) ## a real ROS 1, and ROS 2 Kilted and Jazzy, which tests/ros/set_up_ros2 installs the first time
 	tests/ros/set_up_ros2 $(ROS2) $(PYTHON)
 	tests/ros/set_up_ros2 $(ROS2)-jazzy $(PYTHON) jazzy
 	if [ -e /usr/bin/rosmaster ]; then tests/ros/set_up_ros1 $(ROS1); fi
-	ROS1=$(ROS1) ROS2=$(ROS2) $(BIN)/pytest -q -m ros -n 2 --dist loadfile tests/ros
-	ROS2=$(ROS2)-jazzy $(BIN)/pytest -q -m ros -n 2 --dist loadfile tests/ros/test_*ros2*.py \
+	ROS1=$(ROS1) ROS2=$(ROS2) $(BIN)/pytest -q $(LONG) -m ros -n 2 --dist loadfile tests/ros
+	ROS2=$(ROS2)-jazzy $(BIN)/pytest -q $(LONG) -m ros -n 2 --dist loadfile tests/ros/test_*ros2*.py \
 	    tests/ros/test_topic_robot.py tests/ros/test_nav2_example.py
 
 test-ros1: $(INSTALLED_DEV) ## those of them that need Debian's ROS 1 alone, but for the slow ones
 	tests/ros/set_up_ros1 $(ROS1)
-	ROS1=$(ROS1) $(BIN)/pytest -q -m "ros and not slow" -n 2 --dist worksteal \
+	ROS1=$(ROS1) $(BIN)/pytest -q $(LONG) -m "ros and not slow" -n 2 --dist worksteal \
 	    tests/ros/test_ros1_*.py tests/ros/test_master_guard.py
 
 fuzz: $(INSTALLED_DEV) ## a live service is attacked in all ways, 5 minutes over each wire

@@ -9,6 +9,7 @@ held to it, since a socket or a sleep is an error there.
 from __future__ import annotations
 
 import asyncio
+import faulthandler
 import inspect
 import os
 import signal
@@ -29,9 +30,9 @@ sys.dont_write_bytecode = False
 
 ROOT = Path(__file__).parent
 
-# How long an example takes says how busy the machine is.
-settings.register_profile("no deadlines", deadline=None)
-settings.load_profile("no deadlines")
+# How long an example takes says how busy the machine is, and every run tries the same ones.
+settings.register_profile("repeatable", deadline=None, derandomize=True, database=None)
+settings.load_profile("repeatable")
 
 DEPLOY = "deploy/"
 """The folder of what needs an engine of containers, tunnels or a machine of its own."""
@@ -126,6 +127,27 @@ def _sleep(seconds: float, _really: Callable[[float], None] = time.sleep) -> Non
 sys.addaudithook(_audit)
 
 
+_stderr = -1  # the run's own, which is not captured
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    global _stderr
+    _stderr = os.dup(2)
+
+
+def _end_unless_it_goes_on(config: pytest.Config, bounds: float = 1.0) -> None:
+    """End this process, with the stacks of its threads, unless it goes on within so many bounds."""
+    if (bound_s := float(config.getini("faulthandler_timeout") or 0.0)) > 0.0:
+        faulthandler.dump_traceback_later(bounds * bound_s, exit=True, file=_stderr)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_exception_interact(node: pytest.Item | pytest.Collector) -> None:
+    """Bound the end of a test that has failed, too: pytest has just given its own bound up."""
+    if isinstance(node, pytest.Item) and not node.config.getoption("usepdb"):
+        _end_unless_it_goes_on(node.config)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--rewrite-stories",
@@ -212,16 +234,19 @@ def pytest_runtest_teardown() -> None:
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Hold a test that is not real to what it says of itself."""
     global _guarded
-    if item.get_closest_marker("real"):
-        return (yield)
-    _guarded = item.nodeid
     try:
+        if item.get_closest_marker("real"):
+            return (yield)
+        _guarded = item.nodeid
         with pytest.MonkeyPatch.context() as patch:
             # Python tells the hook of it from 3.13 on.
             patch.setattr(time, "sleep", _sleep)
             return (yield)
     finally:
         _guarded = None
+        # Until the next one, for which a worker may wait as long as a test of another one takes, or
+        # until the end of the process. While a test runs, pytest's bound holds (pyproject.toml).
+        _end_unless_it_goes_on(item.config, 2.0)
 
 
 @pytest.fixture(scope="session", autouse=True)
