@@ -301,7 +301,7 @@ class TestStrangers:
                 to_service.recv(1)
 
     @given(data=st.lists(st.binary(max_size=80), max_size=5), tail=st.binary(max_size=40))
-    @settings(max_examples=30, deadline=None)
+    @settings(max_examples=30)
     def test_arbitrary_datagrams(
         self, data: list[bytes], tail: bytes, robot_tls: TlsFiles, service_tls: TlsFiles
     ) -> None:

@@ -18,10 +18,5 @@ def examples(quick: int, slow: int) -> pytest.MarkDecorator:
 
 def always(examples: int, check: Callable[..., None], *strategies: st.SearchStrategy[Any]) -> None:
     """Check something of so many values of these strategies, the same ones each time."""
-    bounded = settings(
-        max_examples=examples,
-        deadline=None,
-        derandomize=True,
-        suppress_health_check=list(HealthCheck),
-    )
+    bounded = settings(max_examples=examples, suppress_health_check=list(HealthCheck))
     bounded(given(*strategies)(check))()

@@ -321,8 +321,6 @@ def test_hostile_robots_break_no_limit_and_disturb_nobody(runs: int, steps: int)
         settings=settings(
             max_examples=runs,
             stateful_step_count=steps,
-            deadline=None,
-            derandomize=True,
             suppress_health_check=list(HealthCheck),
         ),
     )

@@ -323,7 +323,7 @@ class TestLoss:
         parts=st.integers(0, 4),
         seed=st.integers(0, 1000),
     )
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=60)
     def test_each_part_comes_once_in_order_whatever_is_lost(
         self,
         loss: float,

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.programs import completed
 
 from holdfast.errors import InvalidValueError, LostJournalError, OutputError
 from holdfast.journal import journal as journal_module
@@ -266,20 +267,25 @@ class TestProcesses:
 
     def test_a_fork_does_not_keep_the_lock(self, path: Path) -> None:
         """A robot's own processes may outlive it."""
-        journal = Journal.create(path, {})
-        ends, is_there = os.pipe(), os.pipe()
-        child = os.fork()
-        if child == 0:
-            os.write(is_there[1], b"!")
-            os.read(ends[0], 1)
-            os._exit(0)
-        assert os.read(is_there[0], 1) == b"!"
-        journal.close()
-        Journal.open(path).close()
-        os.write(ends[1], b"!")
-        assert os.waitpid(child, 0)[1] == 0
-        for descriptor in (*ends, *is_there):
-            os.close(descriptor)
+        # In a process of its own: a copy of this one, which has threads, might never run.
+        program = """
+import os, sys
+from pathlib import Path
+from holdfast.journal.journal import Journal
+journal = Journal.create(Path(sys.argv[1]), {})
+is_there, ends = os.pipe(), os.pipe()
+if os.fork() == 0:
+    os.close(ends[1])
+    os.write(is_there[1], b"!")
+    os.read(ends[0], 1)  # until the other one has ended
+    os._exit(0)
+os.read(is_there[0], 1)
+journal.close()
+Journal.open(Path(sys.argv[1])).close()
+print("opened")
+"""
+        done = completed([sys.executable, "-c", program, str(path)], timeout=60.0)
+        assert done.stdout == "opened\n", done.stderr
 
 
 class TestRun:

@@ -119,8 +119,10 @@ class TestTargets:
         # A handler runs between any two instructions of the main thread, also in mid-event.
         before = signal.signal(signal.SIGALRM, lambda *_: log.event("handler"))
         try:
-            signal.setitimer(signal.ITIMER_REAL, 0.001, 0.0005)
             for number in range(3000):
+                # One in each event: by an interval, one would come in another's handler for ever
+                # where a line takes longer than that.
+                signal.setitimer(signal.ITIMER_REAL, 1e-6 * (1 + number % 16))
                 log.event("main", number=number)
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0.0)

@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tests.unit.test_key_ring import contents_of, run_keys
 
@@ -279,7 +279,6 @@ SPECIMEN = x509.load_pem_x509_crl(list_of([5, 7], number=1, until=True)).public_
 
 
 class TestReading:
-    @settings(deadline=None)  # a key is made: how long that takes says nothing
     @given(
         st.lists(st.integers(1, 2**159 - 1), max_size=40, unique=True),
         st.one_of(st.none(), st.integers(0, 2**100)),
@@ -296,7 +295,6 @@ class TestReading:
         path.write_bytes(list_of(serials, number=number, until=until))
         assert revoked_serials(path) == set(serials)
 
-    @settings(deadline=None)
     @given(st.data())
     def test_damage_is_refused_or_read(
         self, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

@@ -102,7 +102,7 @@ class TestBothWays:
         # Nothing hangs on the bytes that were received.
         assert decoded.entropies.flags.owndata and decoded.entropies.flags.writeable
 
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=300)
     @given(cut=st.integers(0, 300), place=st.integers(0, 300), byte=st.integers(0, 255))
     def test_other_bytes_are_refused(self, cut: int, place: int, byte: int) -> None:
         pairs: list[tuple[bytes, Callable[..., Any]]] = [
@@ -117,7 +117,7 @@ class TestBothWays:
             with contextlib.suppress(HoldfastError):
                 decode(bytes(damaged))
 
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=300)
     @given(data=st.binary(max_size=400))
     def test_any_bytes_are_refused_or_read(self, data: bytes) -> None:
         for decode in (decode_request, decode_answer):

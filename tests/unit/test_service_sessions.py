@@ -196,7 +196,7 @@ def _request(what: tuple[int, int, int, bool, bool]) -> Request:
 
 
 @given(st.lists(ACTIONS, max_size=40))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_each_owner_is_answered_as_if_it_were_alone(
     actions: list[tuple[str | None, tuple[int, int, int, bool, bool] | None]],
 ) -> None:

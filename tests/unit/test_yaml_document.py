@@ -38,13 +38,7 @@ DATA = st.dictionaries(
 
 
 @given(DATA)
-@settings(
-    derandomize=True,
-    max_examples=200,
-    deadline=None,
-    database=None,
-    suppress_health_check=[HealthCheck.too_slow],
-)
+@settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow])
 def test_what_is_written_is_read_back_unchanged(data: dict[str, Any]) -> None:
     again = read(write(data).encode(), "written").data
     assert again == data
