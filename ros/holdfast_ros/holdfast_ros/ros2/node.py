@@ -58,7 +58,7 @@ from holdfast_ros.ros2.parameters import (
 )
 from holdfast_ros.ros2.run_segment import Ending, RunSegment, SegmentResult, make_world
 from holdfast_ros.ros2.telemetry import PublishedDecision, Telemetry
-from holdfast_ros.ros2_connections import Connections
+from holdfast_ros.ros2_environment import Connections
 
 _Run = holdfast_interfaces.action.Run
 _Decide = holdfast_interfaces.srv.Decide
