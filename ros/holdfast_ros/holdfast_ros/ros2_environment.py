@@ -308,9 +308,8 @@ class Ros2Environment:
             raise _missing(call, over)
         limit = f"{over.limit_s:g} s ({over.key})"
         if over is absence:
-            raise _UnansweredError(
-                f"{call} has vanished while {what} was waited for; nobody has offered it for {limit}"
-            )
+            missing = f"nobody has offered it for {limit}"
+            raise _UnansweredError(f"{call} has vanished while {what} was waited for; {missing}")
         raise _UnansweredError(f"{call} has not said {what} within {limit}")
 
     def _sent(self, call: RobotCall, client: Any, request: Any) -> Any:
