@@ -323,8 +323,10 @@ class RosNode:
                     finally:
                         self._topics[topic].subscribers.discard(writer)
             else:
-                what = f"service [{service}]" if service else f"topic [{topic}]"
-                reason = f"[{self.name}] has no {what:.200}"
+                reason = "the header names no service and no topic"
+                if service or topic:
+                    verb = "has no service" if service else "does not publish"
+                    reason = f"[{self.name}] {verb} [{service or topic:.200}]"
                 writer.write(encode_header({"error": reason}))
 
     def _agreed(

@@ -1,9 +1,8 @@
 """A ROS 1 master that tells its guard of every change before it confirms it.
 
-A stock master keeps publishers, subscribers, services and parameters in memory, and loses them when
-it is killed. This one is the stock master (``rosmaster``, same code, same answers), but each change
-is in the socket of its guard before the node gets its answer. So the guard knows all that a master
-had confirmed, even the subscribers of parameters, which no call returns.
+It is the stock master (``rosmaster``, same code, same answers), but each change is in the socket of
+its guard before the node gets its answer. So the guard knows all that a master had confirmed, even
+the subscribers of parameters, which no call returns.
 
 ROS's Python runs this file. It may be older than the guard's, so the file imports only the standard
 library and, once it runs, ``rosmaster``. The guard imports :class:`MasterState` and the messages'
@@ -46,11 +45,10 @@ masters have three."""
 
 @dataclass
 class MasterState:
-    """A master's state.
+    """A master's state: registrations are by topic or parameter, and parameters are a tree of dicts.
 
-    ``parameters`` is a tree, in which a namespace is a dict. Registrations are by topic, or by
-    parameter. ``services`` has the node's name, the URI of its XML-RPC server, and the service's
-    own URI; ``types`` has the type of each topic's messages. ``changes`` counts those applied.
+    ``services`` has the node's name, the URI of its XML-RPC server, and the service's own URI;
+    ``types`` has the type of each topic's messages. ``changes`` counts those applied.
     """
 
     parameters: dict[str, Any] = field(default_factory=dict)
@@ -74,10 +72,10 @@ class MasterState:
             getattr(self, table)[key] = value
 
     def _set_parameter(self, key: str, value: Any) -> None:
-        *spaces, last = [part for part in key.split("/") if part] or [""]
-        if not last:
+        if not (parts := [part for part in key.split("/") if part]):
             self.parameters = value
             return
+        *spaces, last = parts
         tree = self.parameters
         for space in spaces:
             inner = tree.get(space)
@@ -103,15 +101,14 @@ class MasterState:
 # -- messages --------------------------------------------------------------------------------------
 
 
+_CLASSES = "xmlrpc.client.Binary", "xmlrpc.client.DateTime", "datetime.datetime"
+
+
 class _PlainData(pickle.Unpickler):
     """Reads what parameters can be, and no code."""
 
     def find_class(self, module: str, name: str) -> Any:
-        if (module, name) in {
-            ("xmlrpc.client", "Binary"),
-            ("xmlrpc.client", "DateTime"),
-            ("datetime", "datetime"),
-        }:
+        if f"{module}.{name}" in _CLASSES:
             return super().find_class(module, name)
         raise pickle.UnpicklingError(f"{module}.{name} is no parameter")
 

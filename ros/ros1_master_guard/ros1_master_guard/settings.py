@@ -50,21 +50,18 @@ class MasterAddress(NamedTuple):
             scheme, host, named = "", None, None
         if scheme != "http" or not host:
             raise GuardError(f"ROS_MASTER_URI is {text!r:.200}; expected http://HOST:PORT")
-        # As rosgraph.network has it.
-        own = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP") or ""
-        version_6 = environment.get("ROS_IPV6") == "on"
-        if own == "localhost" or own.startswith("127.") or own == "::1":
-            loopback = own if own.startswith("127.") else "127.0.0.1"
-            bind = "::1" if version_6 else loopback
-        else:
-            bind = "::" if version_6 else "0.0.0.0"
-        address = cls(host, port or named or DEFAULT_PORT, bind)
         if not _is_here(host):
             raise GuardError(
                 f"ROS_MASTER_URI is {text!r:.200}: {host} is no address of this machine; a guard "
                 "runs where its master runs"
             )
-        return address
+        # As rosgraph.network has it.
+        own = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP") or ""
+        bind = "::" if (version_6 := environment.get("ROS_IPV6") == "on") else "0.0.0.0"
+        if own in ("localhost", "::1") or own.startswith("127."):
+            loopback = own if own.startswith("127.") else "127.0.0.1"
+            bind = "::1" if version_6 else loopback
+        return cls(host, port or named or DEFAULT_PORT, bind)
 
 
 def _is_here(host: str) -> bool:
@@ -91,10 +88,7 @@ class GuardSettings(NamedTuple):
 
 
 def directory_for(named: Path | None) -> Path:
-    """Return a directory that can be written to: the named one, or one of this user alone.
-
-    The latter does not outlive the machine's uptime. Raises GuardError if there is none.
-    """
+    """Return a directory that can be written to: the named one, or one of this user alone."""
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     name = "ros1_master_guard"
     own = Path(runtime) / name if runtime else Path(f"/tmp/{name}-{os.getuid()}")
@@ -116,10 +110,7 @@ def directory_for(named: Path | None) -> Path:
 
 @contextlib.contextmanager
 def guard_lock(port: int) -> Iterator[None]:
-    """Keep other guards of a master away, by a name in the kernel that ends with the process.
-
-    Raises GuardError if there is one already.
-    """
+    """Keep other guards of a master away, by a name in the kernel that ends with the process."""
     name = f"\0ros1_master_guard/{port}"
     with socket.socket(socket.AF_UNIX) as lock:
         try:
@@ -149,12 +140,9 @@ def listens_at(pid: int, port: int) -> bool:
                 fields = line.split()
                 if fields[3] == "0A" and int(fields[1].rpartition(":")[2], 16) == port:
                     sockets.add(f"socket:[{fields[9]}]")
-    try:
-        descriptors = list(Path(f"/proc/{pid}/fd").iterdir())
-    except OSError:
-        return False
-    for descriptor in descriptors:
-        with contextlib.suppress(OSError):
-            if str(descriptor.readlink()) in sockets:
-                return True
+    with contextlib.suppress(OSError):
+        for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+            with contextlib.suppress(OSError):  # it was just closed
+                if str(descriptor.readlink()) in sockets:
+                    return True
     return False

@@ -1,8 +1,7 @@
 """The lifecycle node: parameters in, a run on its own thread, and topics, services and actions.
 
-The node decides nothing. It reads the parameters when it is configured. While it is active, a goal
-of ``~/run`` or a call of ``~/decide`` starts a segment of the run
-(:class:`~holdfast_ros.ros2.run_segment.RunSegment`): the same robot process as in ``holdfast run``.
+It reads the parameters when it is configured. While it is active, a goal of ``~/run`` or a call of
+``~/decide`` starts a segment of the run: the same robot process as in ``holdfast run``.
 Deactivating the node pauses the segment; the next one continues the run.
 
 Threads: rclpy's executor calls the node's methods on several threads. The robot's loop, the
@@ -104,7 +103,7 @@ class _Events:
             self._telemetry.notice()
 
     def close(self) -> None:
-        """Take no more."""
+        """Have nothing to close."""
 
 
 class HoldfastNode(LifecycleNode):  # type: ignore[misc]
@@ -271,7 +270,6 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Hold the run, if there is one, and publish nothing more."""
-        self._bond.break_up()
         self._hold("the node was deactivated")
         return super().on_deactivate(state)
 
@@ -282,7 +280,6 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Hold the run and forget everything."""
-        self._bond.break_up()
         self._hold("the node was shut down")
         super().on_deactivate(state)
         self._forget()
@@ -291,7 +288,6 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Go back to the beginning after a defect."""
         self.get_logger().error("a transition has failed; the node is unconfigured again")
-        self._bond.break_up()
         self._hold("a transition of the node has failed")
         super().on_deactivate(state)
         self._forget()
@@ -299,17 +295,24 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _hold(self, why: str) -> None:
         """End what runs, so that it can go on later, and let nothing begin."""
+        self._bond.break_up()
         with self._changed:
             self._active = False
             segment, telemetry = self._segment, self._telemetry
-            read = self._parameters_read
-        if segment is not None and read is not None:
-            segment.pause(why, read.own.pause_timeout_s)
+        if segment is not None:
+            within_s = self._pause(segment, why)
             # It ends itself within the time that it was given; the rest is for a slow disk.
-            if not segment.ended.wait(read.own.pause_timeout_s + 10.0):
+            if not segment.ended.wait(within_s + 10.0):
                 self.get_logger().error("the run has not ended; its journal has everything")
         if telemetry is not None:
             telemetry.close()
+
+    def _pause(self, segment: RunSegment, why: str) -> float:
+        """Pause a segment; return the time that it was given, in seconds."""
+        read = self._parameters_read
+        within_s = 0.0 if read is None else read.own.pause_timeout_s
+        segment.pause(why, within_s)
+        return within_s
 
     def _forget(self) -> None:
         with self._changed:
@@ -330,11 +333,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     # -- runs ------------------------------------------------------------------------------------
 
-    def _begin_segment(self) -> RunSegment:
+    def _begin_segment(self, read: NodeParameters) -> RunSegment:
         """Start the next part of the run; the caller holds the lock."""
-        read, diagnostics = self._parameters_read, self._diagnostics
-        assert read is not None
-        assert diagnostics is not None
+        assert self._diagnostics is not None
         configuration = read.configuration
         world = make_world(self._robot, read)
         telemetry = Telemetry(
@@ -356,7 +357,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             world=world,
             rate_hz=read.own.rate_hz or None,
             after_reboot=read.own.after_reboot,
-            sink=_Events(self, diagnostics, telemetry),
+            sink=_Events(self, self._diagnostics, telemetry),
             on_order=on_order,
             on_timing=telemetry.time,
             on_end=self._segment_ended,
@@ -396,36 +397,32 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
     def _cancel(self, goal: Any) -> CancelResponse:
         with self._changed:
             segment = self._segment if goal == self._goal else None
-            read = self._parameters_read
-        if segment is not None and read is not None:
-            segment.pause("the goal was cancelled", read.own.pause_timeout_s)
+        if segment is not None:
+            self._pause(segment, "the goal was cancelled")
         return CancelResponse.ACCEPT
 
     def _execute(self, goal: Any) -> Any:
         """Run until it is done, or held; on a thread of the executor."""
         read = self._parameters_read
-        refusal = None
+        refused = _Run.Result(code=_Run.Result.REFUSED, message="the node is not active")
         segment = None
         with self._changed:
-            if not self._active or read is None:
-                refusal = "the node is not active"
-            elif self._goal is not None:
-                refusal = "another goal is running; cancel it, or wait for its result"
-            else:
+            if self._goal is not None:
+                refused.message = "another goal is running; cancel it, or wait for its result"
+            elif self._active and read is not None:
                 try:
                     # One that a call of ~/decide has begun is gone on with.
-                    segment = self._segment or self._begin_segment()
+                    segment = self._segment or self._begin_segment(read)
+                    self._goal = goal
+                    self._goals_ended.clear()
                 except Exception as error:  # noqa: BLE001 - rclpy would call it finished
-                    goal.abort()
-                    return _Run.Result(code=_Run.Result.HELD, message=_in_words(error))
-                self._goal = goal
-                self._goals_ended.clear()
+                    refused = _Run.Result(code=_Run.Result.HELD, message=_in_words(error))
         if segment is None or read is None:
             goal.abort()
-            return _Run.Result(code=_Run.Result.REFUSED, message=refusal or "")
+            return refused
         try:
             if goal.is_cancel_requested:
-                segment.pause("the goal was cancelled", read.own.pause_timeout_s)
+                self._pause(segment, "the goal was cancelled")
             segment.ended.wait()
             outcome = segment.outcome
             assert outcome is not None
@@ -454,28 +451,32 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             response.message = f"{_MOST_CALLS} calls are waiting already; make the same call again"
             return response
         try:
-            return self._decide_one(request, response)
+            self._decide_one(request, response)
         except Exception as error:  # noqa: BLE001 - else there is no answer at all
             response.code, response.message = DecideCode.ENDED, _in_words(error)
-            return response
         finally:
             self._calls.release()
+        return response
 
-    def _decide_one(self, request: Any, response: Any) -> Any:
+    def _decide_one(self, request: Any, response: Any) -> None:
         with self._changed:
             read, last = self._parameters_read, self._last_result
-            reason = self._no_calls()
-            segment: RunSegment | None = None
-            if reason is None and (last is None or last.ending != Ending.FINISHED):
-                segment = self._segment or self._begin_segment()
-        if reason is not None:
-            response.code, response.message = DecideCode.INACTIVE, reason
-            return response
-        handover = None if segment is None else segment.world.handover
-        if handover is None or segment is None or read is None:
-            response.code = DecideCode.FINISHED
-            response.message = "" if last is None else last.message
-            return response
+            if not self._active or read is None:
+                response.code = DecideCode.INACTIVE
+                response.message = f"the node is not active: {self.how_to_activate()}"
+                return
+            if (kind := read.own.environment) != "executive":
+                response.code = DecideCode.INACTIVE
+                response.message = (
+                    f"environment.kind is {kind}: the node itself performs what it decides; it "
+                    "must be executive for calls of ~/decide"
+                )
+                return
+            if last is not None and last.ending == Ending.FINISHED:
+                response.code, response.message = DecideCode.FINISHED, last.message
+                return
+            segment = self._segment or self._begin_segment(read)
+        assert segment.world.handover is not None
         call = DecideRequest(
             request.trial,
             request.number,
@@ -483,7 +484,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             request.reward if request.has_reward else None,
             _DONE.get(request.done, request.done),
         )
-        reply = handover.call(call, read.own.decide_timeout_s)
+        reply = segment.world.handover.call(call, read.own.decide_timeout_s)
         response.code, response.message = reply.code, reply.message
         response.status = segment.status
         due = reply.due
@@ -497,19 +498,6 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
                 response.sensing_action = due.sensing_action
                 names = sensing_labels(read.configuration.problem)
                 response.sensing_action_name = names[due.sensing_action]
-        return response
-
-    def _no_calls(self) -> str | None:
-        """Return why no call can be answered; None if it can."""
-        read = self._parameters_read
-        if not self._active or read is None:
-            return f"the node is not active: {self.how_to_activate()}"
-        if read.own.environment != "executive":
-            return (
-                f"environment.kind is {read.own.environment}: the node itself performs what it "
-                "decides; it must be executive for calls of ~/decide"
-            )
-        return None
 
     # -- what others see -------------------------------------------------------------------------
 
