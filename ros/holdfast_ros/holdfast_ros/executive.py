@@ -2,7 +2,7 @@
 
 Such a program calls; it does not want to be called. So this environment's ``perform_sensing`` and
 ``perform`` publish the decision, and wait until a call of :meth:`DecisionHandover.call` reports its
-outcome. The run is like any other: journalled, resumable, with services that may die.
+outcome.
 
 Calls may be repeated after a lost reply or a crash. So a decision's number follows from its place
 in the trial: the sensing action of step t is number 2 t + 1, the task action is 2 t + 2. A resumed
@@ -69,7 +69,7 @@ class DecideRequest(NamedTuple):
 
 
 class DecideReply(NamedTuple):
-    """The reply to a call; the message says why there is no decision."""
+    """The reply to a call."""
 
     code: DecideCode
     message: str = ""
@@ -99,10 +99,7 @@ class DecisionHandover:
             self._changed.notify_all()
 
     def perform(self, due: DueDecision) -> DecideRequest:
-        """Publish a decision and wait for its outcome.
-
-        Raises EnvironmentFailedError if the run ends first.
-        """
+        """Publish a decision and wait for its outcome; raise an error if the run ends first."""
         with self._changed:
             self._answer = None
             if self._end is None:
@@ -115,10 +112,7 @@ class DecisionHandover:
             return answer
 
     def call(self, call: DecideRequest, within_s: float) -> DecideReply:
-        """Take the outcome of a decision, and return the next decision.
-
-        The reply is ``HOLDING`` after ``within_s``.
-        """
+        """Take the outcome of a decision, and return the next one; HOLDING after ``within_s``."""
         deadline = monotonic() + within_s
         named = call.trial, call.number
         with self._changed:
@@ -211,7 +205,6 @@ class ExecutiveEnvironment:
     def steps_performed(self) -> int:
         """Return how many task actions the journal knows to be performed.
 
-        One that may have begun is handed out again with its number. The executive knows whether it
-        has performed it, and answers without performing it twice.
+        The executive, which is given the next one again, knows whether it has performed that.
         """
         return self._step

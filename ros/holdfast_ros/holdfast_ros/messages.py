@@ -88,20 +88,13 @@ def _hashed_text(name: str) -> str:
 
 
 def encode_request(request: DecisionRequest) -> bytes:
-    """Return a request as a message.
-
-    Raises InvalidValueError if a number does not fit into its field, or the text is none.
-    """
+    """Return a request as a message; raise InvalidValueError if a field cannot hold its value."""
     fields = request._asdict() | {"state": _state_message(request.state)}
     return _encode(_message(_REQUEST, fields | {"observation": _flat(request.observation)}))
 
 
 def decode_request(data: bytes | memoryview) -> DecisionRequest:
-    """Return the request that a message has.
-
-    Raises InvalidValueError if it is no message of this type. Raises CheckpointError if its state
-    is none.
-    """
+    """Return the request that a message has; raise HoldfastError if it is invalid."""
     fields = _decode(data, _REQUEST)
     observation = _array(fields["observation"])
     return DecisionRequest(
@@ -110,10 +103,7 @@ def decode_request(data: bytes | memoryview) -> DecisionRequest:
 
 
 def encode_answer(answer: DecisionAnswer) -> bytes:
-    """Return an answer as a message.
-
-    Raises InvalidValueError if a number does not fit into its field, or a text is none.
-    """
+    """Return an answer as a message; raise InvalidValueError if a field cannot hold its value."""
     actions = answer.task_actions
     fields = answer._asdict() | {
         "state": _state_message(answer.state),
@@ -125,11 +115,7 @@ def encode_answer(answer: DecisionAnswer) -> bytes:
 
 
 def decode_answer(data: bytes | memoryview) -> DecisionAnswer:
-    """Return the answer that a message has.
-
-    Raises InvalidValueError if it is no message of this type, or its fields contradict each other.
-    Raises CheckpointError if its state is none.
-    """
+    """Return the answer that a message has; raise HoldfastError if it is invalid."""
     fields = _decode(data, _RESPONSE)
     try:
         error = ErrorCode(fields["error"])
@@ -169,8 +155,7 @@ def _state_message(state: PlanningState | None) -> Any:
 def _state(message: Any) -> PlanningState | None:
     """Return the state that a message has, or None if it has no particles.
 
-    Raises CheckpointError if this is no state: numbers that are missing or not finite, weights that
-    are negative or do not sum to 1, a negative seed.
+    A state from outside must pass the checks of a checkpoint, else this raises CheckpointError.
     """
     belief = message.belief
     states, weights, size = _array(belief.states), _array(belief.weights), belief.state_size
@@ -183,15 +168,11 @@ def _state(message: Any) -> PlanningState | None:
         )
     head = message.seed, message.trial, message.step, message.stage, bool(message.sensed)
     state = PlanningState(*head, Belief(states.reshape(weights.size, size), weights))
-    # A state from outside must pass the checks of a checkpoint.
     return decode_checkpoint(encode_checkpoint(state))
 
 
 def _message(name: str, values: dict[str, Any], path: str = "") -> Any:
-    """Return a message with these fields' values; raise InvalidValueError if a number is too large.
-
-    ``path`` is what the message is a part of, for the error.
-    """
+    """Return a message with these fields' values; errors name a field with ``path`` before it."""
     store = typestore()
     fields = {}
     for field, (_, kind) in store.fielddefs[name][1]:

@@ -1,11 +1,8 @@
 """A robot behind ROS 2, which offers ``robot/sense``, ``robot/act`` and ``robot/trial``.
 
 Their types are those of ``holdfast_interfaces``: ``srv/Sense``, ``action/Act`` (or ``srv/Act``) and
-``srv/Trial``. A robot that has services and topics of other types is a Python class instead
-(``examples/ros2/topic_robot.py``). This module makes the calls, from a thread that is not the
-executor's. Every wait has a deadline, and ends early when it is cancelled or the service has
-vanished. What the robot has answered is checked by
-:mod:`holdfast.robot.environment_runner`, as for any environment.
+``srv/Trial``. This module makes the calls, from a thread that is not the executor's. Every wait has
+a deadline, and ends early when it is cancelled or the service has vanished.
 
 An action is called as the three services that it is made of: send the goal, get the result, cancel.
 So the goal's identifier is chosen here, and a goal can be cancelled before the robot accepts it.
@@ -119,8 +116,9 @@ class Ros2Environment:
     The robot is brought to its start unless the trial is ``resumed``, because the robot's process
     has died in the midst of it. ``act`` says what ``robot/act`` is: ``action`` or ``service``.
 
-    Raises EnvironmentFailedError if a service is missing for ``environment.discovery_timeout_ms``,
-    or the robot cannot begin the trial.
+    All methods raise EnvironmentFailedError if a service is missing for
+    ``environment.discovery_timeout_ms``, or the robot does not answer in time, rejects what it is
+    asked for, or fails. It may have moved then.
     """
 
     def __init__(
@@ -156,19 +154,12 @@ class Ros2Environment:
     # -- what the robot's loop calls -------------------------------------------------------------
 
     def perform_sensing(self, sensing_action: int) -> FloatArray:
-        """Perform a sensing action and return the observation.
-
-        Raises EnvironmentFailedError if the robot does not answer in time, or refuses.
-        """
+        """Perform a sensing action and return the observation."""
         request = _Sense.Request(trial=self._trial, step=self._step, sensing_action=sensing_action)
         return np.array(self._call(self._sense_call, request).observation)
 
     def perform(self, task_action: FloatArray) -> float | None:
-        """Perform a task action and return its reward.
-
-        Raises EnvironmentFailedError if the robot rejects it, fails, or does not answer in time. It
-        may have moved.
-        """
+        """Perform a task action and return its reward."""
         call = self._act_call
         request = call.type.Goal() if call.is_action else call.type.Request()
         request.trial, request.step = self._trial, self._step
@@ -178,25 +169,18 @@ class Ros2Environment:
         return None if np.isnan(reward) else reward
 
     def is_done(self) -> Done:
-        """Return whether the task is done; a failure has the robot's message as its reason.
-
-        Raises EnvironmentFailedError if the robot does not answer in time.
-        """
+        """Return whether the task is done; a failure has the robot's message as its reason."""
         answer = self._ask()
         return Ending("failed", answer.message) if answer.failed else bool(answer.done)
 
     def steps_performed(self) -> int:
-        """Return how many task actions have been performed in this trial.
-
-        Raises EnvironmentFailedError if the robot does not answer in time.
-        """
+        """Return how many task actions have been performed in this trial."""
         return int(self._ask().steps)
 
     def cancel(self, why: str = "cancelled") -> None:
-        """End the current call, from any thread; an action's goal is cancelled at the robot.
+        """End the current call, and all later ones, from any thread; an action's goal is cancelled.
 
-        The call raises, as do all later ones. An interrupted task action may have been performed;
-        the robot's count says so.
+        An interrupted task action may have been performed; the robot's count says so.
         """
         with self._news:
             self._cancelled = self._cancelled or why

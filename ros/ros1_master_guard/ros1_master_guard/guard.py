@@ -106,7 +106,6 @@ class MasterGuard:
         try:
             with contextlib.closing(Connection(self._uri)) as connection:
                 await self._attach(connection, self._settings.silent_s)
-            return "found"
         except GoneError:
             pass
         except SilentError as error:
@@ -115,6 +114,8 @@ class MasterGuard:
             return "found"
         except CallError as error:
             raise GuardError(f"what is there is no ROS 1 master: {error}") from error
+        else:
+            return "found"
         known = self._read_journal()
         uris = known.nodes()
         gone, silent = await gone_and_silent(uris.values())

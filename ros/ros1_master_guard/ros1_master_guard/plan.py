@@ -81,8 +81,9 @@ async def snapshot(connection: Connection) -> MasterState:
     Nodes and services that ended between two questions are left out. No call returns the
     subscribers of parameters.
     """
-    asked = [("getSystemState", (CALLER,)), ("getTopicTypes", (CALLER,))]
-    asked += [("getParam", (CALLER, "/"))]
+    asked: list[tuple[str, tuple[str, ...]]]
+    asked = [(method, (CALLER,)) for method in ("getSystemState", "getTopicTypes")]
+    asked.append(("getParam", (CALLER, "/")))
     tables, types, parameters = await connection.calls(asked, within_s=_SNAPSHOT_S)
     try:
         state = MasterState(parameters=dict(parameters), types=dict(types))

@@ -45,7 +45,7 @@ masters have three."""
 
 @dataclass
 class MasterState:
-    """A master's state: registrations are by topic or parameter, and parameters are a tree of dicts.
+    """A master's state: registrations by topic or parameter, and a tree of parameters.
 
     ``services`` has the node's name, the URI of its XML-RPC server, and the service's own URI;
     ``types`` has the type of each topic's messages. ``changes`` counts those applied.

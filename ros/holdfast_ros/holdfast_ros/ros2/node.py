@@ -16,6 +16,7 @@ import platform
 import threading
 import time
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import holdfast_interfaces.action
@@ -78,38 +79,20 @@ _RESULT_S = 0.5
 
 _WARNINGS = {"holding", "lost", "sensor_suspect", "wrong_answer"}
 _LOGGED = _WARNINGS | {"status", "resumed", "reinitialised", "stopped"}
-_TOLD_AT_ONCE = _LOGGED | {
-    *("launch_failed", "recovery_exited", "unexplained", "service_vanished", "service_appeared"),
-    "trial",
-}
+_TOLD_AT_ONCE = _LOGGED | {"trial", "launch_failed", "recovery_exited", "unexplained"}
+_TOLD_AT_ONCE |= {"service_vanished", "service_appeared"}
 """Events that change the diagnostics."""
-
-
-class _Events:
-    """Takes the robot's events, on the robot's loop."""
-
-    def __init__(self, node: HoldfastNode, diagnostics: Diagnostics, telemetry: Telemetry) -> None:
-        self._node = node
-        self._diagnostics = diagnostics
-        self._telemetry = telemetry
-
-    def event(self, name: str, /, **fields: object) -> None:
-        """Take an event."""
-        if name in _TOLD_AT_ONCE:
-            self._diagnostics.event(name)
-            if name in _LOGGED:
-                words = f"{name.replace('_', ' ')}: {in_parameters(fields_as_text(fields))}"
-                self._node.log(words, "warning" if name in _WARNINGS else "info")
-            self._telemetry.notice()
-
-    def close(self) -> None:
-        """Have nothing to close."""
 
 
 class HoldfastNode(LifecycleNode):  # type: ignore[misc]
     """The robot's part of active sensing."""
 
     SUCCESS = TransitionCallbackReturn.SUCCESS
+
+    _parameters_read: NodeParameters | None
+    _last_result: SegmentResult | None
+    _telemetry: Telemetry | None
+    _diagnostics: Diagnostics | None
 
     def __init__(self, name: str = "holdfast") -> None:
         super().__init__(
@@ -122,14 +105,11 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         self._robot = Connections(self)
         # Guards the fields below.
         self._changed = threading.RLock()
-        self._parameters_read: NodeParameters | None = None
         self._layout: PoseLayout | None = None
         self._active = False
         self._segment: RunSegment | None = None
-        self._telemetry: Telemetry | None = None
-        self._diagnostics: Diagnostics | None = None
         self._goal: Any = None
-        self._last_result: SegmentResult | None = None
+        self._forget()
         self._calls = threading.BoundedSemaphore(_MOST_CALLS)
         self._goals_ended = threading.Event()
         self._goals_ended.set()
@@ -148,30 +128,20 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             self._frame_publisher = publish(TFMessage, "/tf_static", latched)
         self._bond = Bond(self)
-        self._group = ReentrantCallbackGroup()
-        self._decide_server = self.create_service(
-            _Decide, "~/decide", self._decide, callback_group=self._group
-        )
+        group = ReentrantCallbackGroup()
+        self.create_service(_Decide, "~/decide", self._decide, callback_group=group)
         self._run_server = ActionServer(
-            self,
-            _Run,
-            "~/run",
-            self._execute,
-            callback_group=self._group,
+            *(self, _Run, "~/run", self._execute),
+            callback_group=group,
             goal_callback=self._judge_goal,
             cancel_callback=self._cancel,
         )
-        self._diagnostics_timer = self.create_timer(
-            _DIAGNOSTICS_S,
-            self._tell_diagnostics,
-            callback_group=MutuallyExclusiveCallbackGroup(),
-            # Simulated time may stand still; the diagnostics are to come all the same.
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )
+        # Simulated time may stand still; the diagnostics are to come all the same.
+        clock, alone = Clock(clock_type=ClockType.STEADY_TIME), MutuallyExclusiveCallbackGroup()
+        self.create_timer(_DIAGNOSTICS_S, self._tell_diagnostics, alone, clock)
         self.add_on_set_parameters_callback(self._judge_parameters)
 
-    def log(self, text: str, level: str) -> None:
-        """Log a line."""
+    def _log(self, text: str, level: str) -> None:
         # A logger of rclpy's lets a place in the code have one level for ever.
         getattr(get_logger(self.get_logger().name), level)(text)
 
@@ -200,10 +170,8 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _values(self) -> Mapping[str, Any]:
         """Return what was given: not what the node itself has shown, and nobody has changed."""
-        values = {
-            name: _plain(parameter.value)
-            for name, parameter in self.get_parameters_by_prefix("").items()
-        }
+        parameters = self.get_parameters_by_prefix("").items()
+        values = {name: _plain(parameter.value) for name, parameter in parameters}
         return {name: value for name, value in values.items() if self._shown.get(name) != value}
 
     def _show_in_force(self, read: NodeParameters, given: Mapping[str, Any]) -> None:
@@ -243,10 +211,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         except Exception as error:  # noqa: BLE001 - rclpy would hide it
             self.get_logger().error(f"not configured: {_in_words(error)}")
             return TransitionCallbackReturn.FAILURE
+        self._forget()
         with self._changed:
-            self._parameters_read = read
-            self._layout = layout
-            self._last_result = None
+            self._parameters_read, self._layout = read, layout
             self._diagnostics = Diagnostics(read.configuration.recovery)
         self.get_logger().info(
             f"configured: {read.configuration.problem_name}, "
@@ -263,8 +230,8 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         if read is not None:
             self._bond.form(read.own.bond_heartbeat_period)
             if self._frame_publisher is not None and layout is not None and read.own.map_frame:
-                frames, now = (read.own.map_frame, read.own.frame_id), self.get_clock().now()
-                message = messages.frame_message(*frames, layout.upright, now.to_msg())
+                frames = read.own.map_frame, read.own.frame_id
+                message = messages.frame_message(*frames, layout.upright, self._now())
                 self._frame_publisher.publish(message)
         return result
 
@@ -316,10 +283,8 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _forget(self) -> None:
         with self._changed:
-            self._parameters_read = None
-            self._last_result = None
-            self._telemetry = None
-            self._diagnostics = None
+            self._parameters_read = self._last_result = None
+            self._telemetry = self._diagnostics = None
 
     def end(self) -> bool:
         """End in order, in any state, when the process is asked to; return whether the run has."""
@@ -335,11 +300,10 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _begin_segment(self, read: NodeParameters) -> RunSegment:
         """Start the next part of the run; the caller holds the lock."""
-        assert self._diagnostics is not None
-        configuration = read.configuration
-        world = make_world(self._robot, read)
+        diagnostics, world = self._diagnostics, make_world(self._robot, read)
+        assert diagnostics is not None
         telemetry = Telemetry(
-            configuration,
+            read.configuration,
             self._show_order,
             self._show_belief,
             self._tell_diagnostics,
@@ -348,22 +312,30 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             wants_entropies=self._wants_entropies,
         )
 
+        def event(name: str, /, **fields: object) -> None:
+            """Take an event, on the robot's loop."""
+            if name in _TOLD_AT_ONCE:
+                diagnostics.event(name)
+                if name in _LOGGED:
+                    words = f"{name.replace('_', ' ')}: {in_parameters(fields_as_text(fields))}"
+                    self._log(words, "warning" if name in _WARNINGS else "info")
+                telemetry.notice()
+
         def on_order(state: PlanningState, order: Act | Sense) -> None:
             telemetry.order(state, order, segment.status)
 
         segment = RunSegment(
-            configuration=configuration,
+            configuration=read.configuration,
             path=read.run_directory,
             world=world,
             rate_hz=read.own.rate_hz or None,
             after_reboot=read.own.after_reboot,
-            sink=_Events(self, self._diagnostics, telemetry),
+            sink=SimpleNamespace(event=event, close=lambda: None),
             on_order=on_order,
             on_timing=telemetry.time,
             on_end=self._segment_ended,
         )
-        self._telemetry = telemetry
-        self._segment = segment
+        self._telemetry, self._segment = telemetry, segment
         segment.start()
         return segment
 
@@ -371,14 +343,14 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         with self._changed:
             telemetry, segment = self._telemetry, self._segment
             self._last_result = outcome
-        handover = None if segment is None else segment.world.handover
-        if handover is not None:
+        if segment is not None and segment.world.handover is not None:
             finished = outcome.ending == Ending.FINISHED
-            handover.end(DecideCode.FINISHED if finished else DecideCode.ENDED, outcome.message)
+            code = DecideCode.FINISHED if finished else DecideCode.ENDED
+            segment.world.handover.end(code, outcome.message)
         if telemetry is not None:
             telemetry.close()
         level = "info" if outcome.ending in (Ending.FINISHED, Ending.PAUSED) else "error"
-        self.log(f"{outcome.ending.name.lower()}: {outcome.message}", level)
+        self._log(f"{outcome.ending.name.lower()}: {outcome.message}", level)
         with self._changed:
             self._segment = None
         self._tell_diagnostics()
@@ -387,11 +359,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         del request
         if self._active:
             return GoalResponse.ACCEPT
-        state = self._state_machine.current_state[1]
-        self.get_logger().warning(
-            f"a goal of ~/run was rejected: the node is {state}, and takes goals while it is "
-            f"active: {self.how_to_activate()}"
-        )
+        state, how = self._state_machine.current_state[1], self.how_to_activate()
+        reason = f"the node is {state}, and takes goals while it is active: {how}"
+        self.get_logger().warning(f"a goal of ~/run was rejected: {reason}")
         return GoalResponse.REJECT
 
     def _cancel(self, goal: Any) -> CancelResponse:
@@ -505,9 +475,8 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         read, goal, segment = self._parameters_read, self._goal, self._segment
         if read is None or not self._active:
             return
-        problem = read.configuration.problem
-        now = self.get_clock().now().to_msg()
-        message = messages.decision_message(shown, problem, read.own.frame_id, now)
+        place = read.configuration.problem, read.own.frame_id, self._now()
+        message = messages.decision_message(shown, *place)
         self._decision_publisher.publish(message)
         if goal is not None:
             finished = 0 if segment is None else segment.num_finished
@@ -519,21 +488,23 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         return heard and read is not None and read.own.publish_entropies
 
     def _tell_failure(self, error: Exception) -> None:
-        self.get_logger().warning(
-            f"not all is published of what the robot decides: {_in_words(error)}"
-        )
+        reason = _in_words(error)
+        self.get_logger().warning(f"not all is published of what the robot decides: {reason}")
+
+    def _now(self) -> Any:
+        return self.get_clock().now().to_msg()
 
     def _show_belief(self, state: PlanningState) -> None:
         read, layout = self._parameters_read, self._layout
         if read is None or not self._active:
             return
-        now = self.get_clock().now().to_msg()
         if self._belief_publisher.get_subscription_count():
             problem = read.configuration.problem
             self._belief_publisher.publish(messages.belief_message(state.belief, problem))
         if layout is not None and self._cloud_publisher.get_subscription_count():
             poses = layout.poses(state.belief.states)
-            self._cloud_publisher.publish(messages.pose_array(poses, read.own.frame_id, now))
+            cloud = messages.pose_array(poses, read.own.frame_id, self._now())
+            self._cloud_publisher.publish(cloud)
 
     def _tell_diagnostics(self) -> None:
         with self._changed:
@@ -551,7 +522,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             values=[KeyValue(key=key, value=value) for key, value in facts.items()],
         )
         message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = self._now()
         self._diagnostics_publisher.publish(message)
         # The status; after the end of the run, how it ended.
         word = told.word if segment is None else told.facts["status"] or told.word
