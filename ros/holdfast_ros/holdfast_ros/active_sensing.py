@@ -29,26 +29,19 @@ _NONE = np.empty(0)
 class RequestKind(enum.IntEnum):
     """The kind of a request."""
 
-    INITIALIZE = 0
-    """Return the state that a trial begins with."""
-    CHOOSE_SENSING_ACTION = 1
-    """Choose what to sense."""
-    CHOOSE_TASK_ACTIONS = 2
-    """Choose the task actions after an observation."""
+    INITIALIZE = 0  # return the state that a trial begins with
+    CHOOSE_SENSING_ACTION = 1  # choose what to sense
+    CHOOSE_TASK_ACTIONS = 2  # choose the task actions after an observation
 
 
 class ErrorCode(enum.IntEnum):
     """Why there is no answer."""
 
     OK = 0
-    BAD_REQUEST = 1
-    """The request is invalid for every service."""
-    OTHER_CONFIGURATION = 2
-    """This service plans with another configuration or other code."""
-    PROBLEM_FAILED = 3
-    """The problem's own code has raised an error."""
-    BUSY = 4
-    """Too many requests: another service may answer now, or this one later."""
+    BAD_REQUEST = 1  # the request is invalid for every service
+    OTHER_CONFIGURATION = 2  # this service plans with another configuration or other code
+    PROBLEM_FAILED = 3  # the problem's own code has raised an error
+    BUSY = 4  # too many requests: another service may answer now, or this one later
 
 
 ANOTHER_MAY_ANSWER = (ErrorCode.OTHER_CONFIGURATION, ErrorCode.BUSY)
@@ -56,37 +49,27 @@ ANOTHER_MAY_ANSWER = (ErrorCode.OTHER_CONFIGURATION, ErrorCode.BUSY)
 
 
 class DecisionRequest(NamedTuple):
-    """A request; fields that its kind does not need keep their defaults.
-
-    ``configuration`` is the digest of the required one; if it is empty, the service's is accepted.
-    ``observation``, of shape ``(observation_size,)``, is what the performed ``sensing_action`` has
-    shown; NaN in every component is no reading.
-    """
+    """A request; fields that its kind does not need keep their defaults."""
 
     kind: int
-    configuration: str = ""
+    configuration: str = ""  # digest of the required one; empty accepts the service's
     seed: int = 0
     trial: int = 0
     state: PlanningState | None = None
-    sensing_action: int = 0
-    observation: FloatArray = _NONE
+    sensing_action: int = 0  # that was performed
+    observation: FloatArray = _NONE  # what it has shown; NaN in every component: no reading
 
 
 class DecisionAnswer(NamedTuple):
-    """An answer; fields that its request did not ask for are empty.
-
-    ``message`` says why there is no answer, ``state`` is for the next request. ``entropies``, of
-    shape ``(J,)``, are those expected after each sensing action, in nats; empty if the selector has
-    none. ``task_actions``, of shape ``(n, action_size)``, lead to the next sensing step.
-    """
+    """An answer; fields that its request did not ask for are empty."""
 
     error: ErrorCode
-    message: str
+    message: str  # why there is no answer
     configuration: str
-    state: PlanningState | None = None
+    state: PlanningState | None = None  # for the next request
     sensing_action: int = 0
-    entropies: FloatArray = _NONE
-    task_actions: FloatArray = np.empty((0, 0))
+    entropies: FloatArray = _NONE  # expected after each sensing action, in nats
+    task_actions: FloatArray = np.empty((0, 0))  # one a row, up to the next sensing step
 
 
 def configuration_digest(configuration: Configuration) -> str:

@@ -90,16 +90,11 @@ class _Asker:
 class ActiveSensingClient:
     """Asks the cloud, and the recovery service when the cloud does not answer.
 
-    Both are asked on ``thread``, which is closed with the client. The cloud has ``deadline_s`` for
-    an answer. After a miss it decides again once it answers within this time. The recovery service,
-    the last resort, gets more with each request that takes longer.
-
-    ``on_event`` gets each change as ``on_event(name, **fields)``, on that thread: ``status``
-    (``status``, ``reason``) and ``holding`` (``reason``) while no service answers. By default they
-    are logged as warnings of ``rosout.holdfast_ros``. ``decided_by`` is the name of the service
-    whose answer was returned last.
-
-    Raises InvalidValueError if ``deadline_s`` is not above 0 and at most 3600.
+    Both are asked on ``thread``, which is closed with the client. The cloud has ``deadline_s``, at
+    most an hour, for an answer. ``on_event`` gets each change as ``on_event(name, **fields)``, on
+    that thread: ``status`` (``status``, ``reason``) and ``holding`` (``reason``) while no service
+    answers. By default they are logged as warnings of ``rosout.holdfast_ros``. ``decided_by`` is
+    the name of the service whose answer was returned last.
     """
 
     def __init__(

@@ -32,30 +32,21 @@ class DecideCode(enum.IntEnum):
     """The result of a call."""
 
     OK = 0
-    HOLDING = 1
-    """There is no decision yet: repeat the call."""
-    FINISHED = 2
-    """All trials are finished."""
-    BAD_REQUEST = 3
-    """The reported outcome was refused; the decision is still due."""
-    INACTIVE = 4
-    """No run is active."""
-    ENDED = 5
-    """The run has ended early."""
+    HOLDING = 1  # there is no decision yet: repeat the call
+    FINISHED = 2  # all trials are finished
+    BAD_REQUEST = 3  # the reported outcome was refused; the decision is still due
+    INACTIVE = 4  # no run is active
+    ENDED = 5  # the run has ended early
 
 
 class DueDecision(NamedTuple):
-    """A decision whose outcome is awaited; ``trial`` and ``number`` identify it.
-
-    ``sensing_action`` is None for a task action, and ``task_action``, of shape ``(action_size,)``,
-    is empty for a sensing action. ``step`` counts the task actions before it.
-    """
+    """A decision whose outcome is awaited; ``trial`` and ``number`` identify it."""
 
     trial: int
     number: int
-    step: int
-    sensing_action: int | None
-    task_action: FloatArray = _NO_NUMBERS
+    step: int  # task actions before it
+    sensing_action: int | None  # None for a task action
+    task_action: FloatArray = _NO_NUMBERS  # of shape (action_size,); empty for a sensing action
 
 
 class DecideRequest(NamedTuple):

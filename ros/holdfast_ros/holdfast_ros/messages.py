@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from holdfast_ros.active_sensing import ActiveSensing
 
 SERVICE = "holdfast_interfaces/srv/ActiveSensing"
-"""The service's type."""
-
 MAX_BYTES = 16_000_000
 """Largest message; a state of 100,000 particles in nine coordinates has half of it."""
 

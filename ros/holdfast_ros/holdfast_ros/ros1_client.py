@@ -40,12 +40,9 @@ STATUS_WORDS: Final = {
 }
 """The first implementation's spelling of the statuses."""
 
-_LOOKUP_S: Final = 1.0
-"""For the master, where the service is known to have been somewhere."""
-
+_LOOKUP_S: Final = 1.0  # for the master, where the service is known to have been somewhere
 _START_S: Final = 5.0
 _CLOSE_S: Final = 1.0
-
 _STATUS_TYPE: Final = RosType(
     "std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n"
 )

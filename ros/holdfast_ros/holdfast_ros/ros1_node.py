@@ -34,32 +34,23 @@ ServiceHandler = Callable[[bytes], Awaitable[bytes]]
 """Takes a request's bytes and returns the response's."""
 
 _OPENING_S: Final = 5.0
-_IDLE_S: Final = 60.0
-"""An XML-RPC connection without a call for this long is closed."""
-
-_REQUEST_S: Final = 10.0
-"""From a request's first byte to its last; a slower caller loses the connection."""
-
-_MASTER_S: Final = 1.0
-"""For one call to the master."""
-
+_IDLE_S: Final = 60.0  # an XML-RPC connection without a call for this long is closed
+_REQUEST_S: Final = 10.0  # from a request's first byte to its last
+_MASTER_S: Final = 1.0  # for one call to the master
 _CHECK_INTERVAL_S: Final = 1.0
-_RETRY_S: Final = 0.1
-"""After the master could not be reached."""
+_RETRY_S: Final = 0.1  # after the master could not be reached
+_MAX_UNREAD_BYTES: Final = 64 << 10
+"""Bound on what waits for a subscriber; further messages are dropped."""
 
 _MAX_CALL_BYTES: Final = 8 << 10
 """An XML-RPC call to a node has some hundred bytes. Parsing takes a microsecond for each of them,
 during which nobody else is served."""
 
-_MAX_UNREAD_BYTES: Final = 64 << 10
-"""Bound on what waits for a subscriber; further messages are dropped."""
-
 _TURNS_TO_BEGIN: Final = 4
 """Turns of the loop until asyncio serves a connection that it has accepted. Before that it is in no
 list of ours, and would stay open."""
 
-_UNKNOWN: Final = -1
-_OK: Final = 1
+_UNKNOWN, _OK = -1, 1
 
 
 class Topic:
@@ -128,10 +119,8 @@ class RosNode:
         self._topics[topic.name] = topic
         return topic
 
-    async def start(self, within_s: float = 2.0) -> bool:
-        """Listen, and register with the master; return whether the master knows this node.
-
-        After ``within_s`` without an answer, registration goes on in the background.
+    async def start(self, within_s: float = 2.0) -> None:
+        """Listen, and register with the master, after ``within_s`` in the background.
 
         Raises TransportError if it cannot listen.
         """
@@ -146,9 +135,8 @@ class RosNode:
                 )
         except OSError as error:
             self._stop()
-            raise TransportError(
-                f"cannot listen on {environment.bind}: {why_not_bound(error)}"
-            ) from error
+            reason = f"cannot listen on {environment.bind}: {why_not_bound(error)}"
+            raise TransportError(reason) from error
         ports = [server.sockets[0].getsockname()[1] for server in self._servers]
         self._uri = f"http://{host_and_port(environment.host, ports[0])}/"
         self._port = ports[1]
@@ -156,7 +144,6 @@ class RosNode:
         self._registration = asyncio.create_task(self._stay_registered(registered))
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(registered.wait(), within_s)
-        return self._is_known
 
     async def close(self, within_s: float = 1.0) -> None:
         """Unregister, and end all connections; may be repeated."""

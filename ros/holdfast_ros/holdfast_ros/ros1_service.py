@@ -23,8 +23,7 @@ from holdfast_ros.ros1_node import RosNode
 _START_S = 5.0
 
 MAX_WAITING = 64
-"""Requests that may wait besides the one that is being answered. The next one is refused as busy,
-so that the client can ask another service."""
+"""Requests that may wait besides the one that is being answered, before others are refused."""
 
 
 class Ros1Server:

@@ -38,13 +38,10 @@ _PART = 0.45
 """Share of ``environment.timeout_ms``, for a task action and for asking whether it was the last."""
 
 _DISCOVERY = "environment.discovery_timeout_ms"
-
 _FIND_S, _LOOK_S = 0.02, 0.2
 """Intervals at which a wait checks that a service is there: at first, and then still."""
 
-_CANCEL_S = 1.0
-"""Longest wait for the answer to a cancellation."""
-
+_CANCEL_S = 1.0  # for the answer to a cancellation
 _GOAL_ENDED = {4: "succeeded", 5: "was cancelled", 6: "was aborted"}
 """``action_msgs/msg/GoalStatus`` of ended goals."""
 

@@ -14,8 +14,7 @@ from ros1_master_guard.errors import ProtocolError
 MAX_HEADER_BYTES = 64 * 1024
 """Bound on a connection header; a topic's contains the whole definition of its type."""
 
-ANY_TYPE = "*"
-"""The digest that matches any type."""
+ANY_TYPE = "*"  # the digest that matches any type
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:

@@ -32,9 +32,7 @@ from typing import Any, Dict, List, NoReturn, Tuple  # noqa: UP035 (older Python
 Registrations = Dict[str, List[Tuple[str, str]]]  # noqa: UP006
 """Nodes of each topic or parameter: name and URI of the node's XML-RPC server."""
 
-HEAD = struct.Struct("<Q")
-"""The size in bytes that precedes each message."""
-
+HEAD = struct.Struct("<Q")  # the size in bytes that precedes each message
 _SEND_S, _SEND_STATE_S = 1.0, 10.0
 """A guard that takes longer to read a change, or the state, is told no more; it asks again."""
 
@@ -45,17 +43,14 @@ masters have three."""
 
 @dataclass
 class MasterState:
-    """A master's state: registrations by topic or parameter, and a tree of parameters.
-
-    ``services`` has the node's name, the URI of its XML-RPC server, and the service's own URI;
-    ``types`` has the type of each topic's messages. ``changes`` counts those applied.
-    """
+    """A master's state: registrations by topic or parameter, and a tree of parameters."""
 
     parameters: dict[str, Any] = field(default_factory=dict)
     publishers: Registrations = field(default_factory=dict)
     subscribers: Registrations = field(default_factory=dict)
+    # Of each service the node's name, the URI of the node's XML-RPC server, and the service's own.
     services: dict[str, tuple[str, str, str]] = field(default_factory=dict)
-    types: dict[str, str] = field(default_factory=dict)
+    types: dict[str, str] = field(default_factory=dict)  # of topics
     parameter_subscribers: Registrations = field(default_factory=dict)
     changes: int = field(default=0, compare=False)
 
@@ -359,9 +354,6 @@ def main() -> NoReturn:
             state = MasterState(**decoded(told.read(size)))
     except (OSError, EOFError, struct.error, pickle.UnpicklingError):
         sys.exit(0)  # the guard is no more
-    # What a stock master prints, it prints for nobody here.
-    with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
-        os.dup2(nowhere.fileno(), 1)
     _serve(listening, make(state), guard)
     # Threads of calls that hang must not keep it.
     os._exit(0)

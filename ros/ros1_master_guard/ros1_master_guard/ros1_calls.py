@@ -18,9 +18,7 @@ from urllib.parse import urlsplit
 from ros1_master_guard.errors import CallError, GoneError, ProtocolError, SilentError
 from ros1_master_guard.headers import MAX_HEADER_BYTES, host_and_port_of
 
-CALLER: Final = "/ros1_master_guard"
-"""Name of the caller where no node calls."""
-
+CALLER: Final = "/ros1_master_guard"  # where no node calls
 _MAX_RESPONSE_BYTES: Final = 256 * 1024 * 1024
 
 MAX_SHORT_BYTES: Final = 16 * 1024
@@ -113,8 +111,7 @@ class Connection:
     ) -> list[Any]:
         """Make several calls in one request; the value of a refused one is None.
 
-        Each call is a method and all its arguments, the caller's name included. Raises as
-        :meth:`call` does.
+        Each is a method and all its arguments, the caller's name included.
         """
         batch = [{"methodName": method, "params": list(arguments)} for method, arguments in calls]
         responses = await self._request("system.multicall", (batch,), within_s)

@@ -37,10 +37,9 @@ class MasterAddress(NamedTuple):
 
     @classmethod
     def of(cls, environment: Mapping[str, str], port: int | None = None) -> Self:
-        """Read ``ROS_MASTER_URI``, ``ROS_HOSTNAME``, ``ROS_IP`` and ``ROS_IPV6``.
+        """Read ROS's variables; ``port`` replaces the URI's.
 
-        ``port`` replaces that of the URI. Raises GuardError if the URI is none, or names another
-        machine.
+        Raises GuardError if the URI is none, or names another machine.
         """
         text = environment.get("ROS_MASTER_URI") or f"http://localhost:{DEFAULT_PORT}"
         try:
@@ -122,9 +121,8 @@ def guard_lock(port: int) -> Iterator[None]:
                 asking.connect(name)
                 who = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 4)
                 pid = str(int.from_bytes(who, sys.byteorder))
-            raise GuardError(
-                f"the master at port {port} has a guard already: process {pid}"
-            ) from None
+            reason = f"the master at port {port} has a guard already: process {pid}"
+            raise GuardError(reason) from None
         yield
 
 

@@ -17,8 +17,7 @@ from ros1_master_guard.errors import GuardError
 from ros1_master_guard.process import HEAD, MasterState, decoded, encoded
 from ros1_master_guard.settings import GuardSettings
 
-_START_S = 30.0
-_END_S = 2.0
+_START_S, _END_S = 30.0, 2.0
 _READ_BYTES = 1 << 20
 
 

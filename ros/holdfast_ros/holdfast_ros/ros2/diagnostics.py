@@ -21,12 +21,7 @@ _HOLDING = "holding still"
 _ALARMS = ("lost", "sensor_suspect", "wrong_answer")
 
 
-class Level(enum.IntEnum):
-    """As ROS counts."""
-
-    OK = 0
-    WARN = 1
-    ERROR = 2
+Level = enum.IntEnum("Level", ["OK", "WARN", "ERROR"], start=0)  # as ROS counts
 
 
 class RobotDiagnosis(NamedTuple):

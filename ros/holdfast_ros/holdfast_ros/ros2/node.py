@@ -63,20 +63,15 @@ from holdfast_ros.ros2_environment import Connections
 _Run = holdfast_interfaces.action.Run
 _Decide = holdfast_interfaces.srv.Decide
 
-_MOST_CALLS = 3
-"""Calls of ``~/decide`` that may wait at once."""
+_MOST_CALLS = 3  # of ~/decide may wait at once
+NUM_THREADS = 4 + _MOST_CALLS
+"""A goal and the calls may keep theirs for a while; the rest is always free."""
 
 _DONE: Mapping[int, Any] = {0: False, 1: True, 2: "failed"}
 """Values of a call's ``done``; any other number is refused."""
 
-NUM_THREADS = 4 + _MOST_CALLS
-"""A goal and the calls may keep theirs for a while; the rest is always free."""
-
 _DIAGNOSTICS_S = 1.0
-
-_RESULT_S = 0.5
-"""At the end of the process: for the client that waits for its result to get it."""
-
+_RESULT_S = 0.5  # at the end of the process, for the client of the goal to get its result
 _WARNINGS = {"holding", "lost", "sensor_suspect", "wrong_answer"}
 _LOGGED = _WARNINGS | {"status", "resumed", "reinitialised", "stopped"}
 _TOLD_AT_ONCE = _LOGGED | {"trial", "launch_failed", "recovery_exited", "unexplained"}

@@ -25,8 +25,6 @@ _SECTIONS_OF_PROBLEMS = ("model.", "state_space_planner.")
 _ARGUMENTS = "environment.arguments."
 _OF_ROS = ("use_sim_time", "start_type_description_service")
 _OF_ROS_SECTIONS = ("qos_overrides.",)
-
-
 _Text = Annotated[str, msgspec.Meta(max_length=4096)]
 
 
@@ -76,8 +74,7 @@ OWN: Mapping[str, str] = {
     "decide_timeout_s": "a call of ~/decide is answered within this time, s",
     "pause_timeout_s": "how long a run that is to be held waits for the robot, s",
     "belief_rate_hz": "beliefs published a second, at most",
-    "publish_entropies": "whether to compute the entropies of each decision once more, to publish "
-    "them",
+    "publish_entropies": "whether to compute each decision's entropies once more and publish them",
     "bond_heartbeat_period": "period of the heartbeat for Nav2's lifecycle manager, s; 0: none. "
     "It needs the package bond",
 }
@@ -90,7 +87,6 @@ _OBJECTS = {
     "ros": "holdfast_ros.ros2_environment:RosEnvironment",
 }
 """What the run's configuration names, so that no other world goes on with that run."""
-
 
 _FOR_OPTIONS = {
     " (--resume)": "",

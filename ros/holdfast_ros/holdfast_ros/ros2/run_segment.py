@@ -1,7 +1,6 @@
 """A segment of a run, on its own thread: from the end of the journal until all trials are done.
 
-A segment ends early when it is paused or something fails. The next segment continues there, in this
-process or another one.
+It ends early when it is paused or something fails. The next one continues there.
 """
 
 from __future__ import annotations
@@ -40,26 +39,18 @@ from holdfast.runtime.events import EventSink
 from holdfast_ros.executive import DecideCode, DecisionHandover, ExecutiveEnvironment
 from holdfast_ros.ros2.parameters import NodeParameters, in_parameters
 
-MAX_TRIALS_TOLD = 10_000
-"""Most trials in a result; ``trials.csv`` has all."""
-
-_INTERRUPTED_S = 2.0
-"""For a call of the environment that was interrupted to end."""
-
+MAX_TRIALS_TOLD = 10_000  # in a result; trials.csv has all
+_INTERRUPTED_S = 2.0  # for a call of the environment that was interrupted to end
 _CANNOT_GO_ON = (UnknownPerformanceError, LostJournalError, StaleEpochError)
 
 
 class Ending(enum.IntEnum):
     """How a segment ended."""
 
-    FINISHED = 0
-    """All trials are finished."""
-    PAUSED = 1
-    """It was asked to pause."""
-    HELD = 2
-    """An error; the run can continue once its cause is gone."""
-    FAILED = 3
-    """An error; the run cannot continue."""
+    FINISHED = 0  # all trials are finished
+    PAUSED = 1  # it was asked to pause
+    HELD = 2  # an error; the run can continue once its cause is gone
+    FAILED = 3  # an error; the run cannot continue
 
 
 class SegmentResult(NamedTuple):
@@ -76,24 +67,16 @@ class SegmentResult(NamedTuple):
 
 
 class World(NamedTuple):
-    """What a segment acts on.
-
-    ``interrupt`` gets a reason and ends the environment's current call where possible. A pause does
-    so at once if an interrupted call is repeated later, so that it costs nothing. ``handover`` is
-    where calls of ``~/decide`` meet the run; None where the node itself performs.
-    """
+    """What a segment acts on."""
 
     maker: EnvironmentMaker
-    interrupt: Callable[[str], None]
-    interrupt_at_once: bool = False
-    handover: DecisionHandover | None = None
+    interrupt: Callable[[str], None]  # ends the current call where possible, for a reason
+    interrupt_at_once: bool = False  # an interrupted call is repeated later, so it costs nothing
+    handover: DecisionHandover | None = None  # where calls of ~/decide meet the run
 
 
 def make_world(connections: Any, parameters: NodeParameters) -> World:
-    """Make what the parameters name, for one segment of a run.
-
-    Raises HoldfastError if that cannot be; the message names the parameter.
-    """
+    """Make what the parameters name, for one segment of a run."""
     configuration, own = parameters.configuration, parameters.own
     if own.environment == "configuration":
         return World(load_environment(configuration), lambda _: None)
@@ -158,23 +141,20 @@ class RunSegment:
 
     def condition(self) -> Condition | None:
         """Return how the robot is doing; None before it runs."""
-        process = self._process
-        return None if process is None else process.condition()
+        return None if self._process is None else self._process.condition()
 
     @property
     def status(self) -> str:
         """Who decides."""
-        process = self._process
-        return "" if process is None else process.robot.status.value
+        return "" if self._process is None else self._process.robot.status.value
 
     @property
     def unexplained_observations(self) -> int:
         """Those of the trial that is running."""
-        process = self._process
-        return 0 if process is None else process.robot.unexplained_observations
+        return 0 if self._process is None else self._process.robot.unexplained_observations
 
     def pause(self, why: str, within_s: float) -> None:
-        """End in order, from any thread: :attr:`ended` says when. Only the first call counts.
+        """End in order, from any thread; only the first call counts.
 
         The environment has ``within_s`` to end its current call, which is then interrupted, and
         abandoned if that does not help.

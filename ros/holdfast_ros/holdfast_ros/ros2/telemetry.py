@@ -26,15 +26,11 @@ from holdfast.protocol.robot_events import Act, Sense, Timing
 from holdfast.protocol.status import Status
 from holdfast.robot.links import RECOVERY_SERVICE
 
-_MAX_STATE_BYTES = 32 << 20
-_MIN_STATES = 4
+_MAX_STATE_BYTES, _MIN_STATES = 32 << 20, 4
 """Notes keep their states up to this memory, the last four in any case."""
 
-_LATE_S = 1.0
-"""A belief that is older than this is shown no more."""
-
+_LATE_S = 1.0  # a belief that is older than this is shown no more
 _MAX_NOTES = 1000
-
 _NICENESS = 10
 _NOTHING: FloatArray = np.empty(0)
 
@@ -45,23 +41,18 @@ _ENTROPIES = ("action_entropy", "path_entropy", "state_entropy", "action_covaria
 
 @dataclass(slots=True)
 class PublishedDecision:
-    """An order to the environment, for people.
-
-    It is a sensing action, with ``entropies`` of shape ``(J,)`` if they were computed, or a task
-    action, of shape ``(action_size,)``. ``state``, in which it was decided, is None if there was no
-    time for it. ``noted_at`` is on the monotonic clock, in seconds.
-    """
+    """An order to the environment, for people."""
 
     trial: int
     step: int
     stage: int
-    sensing_action: int | None
-    entropies: FloatArray
-    task_action: FloatArray
+    sensing_action: int | None  # None for a task action
+    entropies: FloatArray  # of shape (J,); empty if they were not computed
+    task_action: FloatArray  # of shape (action_size,); empty for a sensing action
     status: str
     decided_by: str
-    state: PlanningState | None
-    noted_at: float
+    state: PlanningState | None  # in which it was decided; None if there was no time for it
+    noted_at: float  # on the monotonic clock, in seconds
 
 
 class Telemetry:
@@ -104,14 +95,11 @@ class Telemetry:
         self._thread.start()
 
     def decided_in(self, status: str) -> str:
-        """Return who decides in this status; empty before its first decision.
-
-        In local recovery the robot may still use an answer that the service which died had given:
-        it decides no more.
-        """
+        """Return who decides in this status; empty before its first decision."""
         timing = self._decided_last
         if timing is None or timing.status != status:
             return ""
+        # The robot may still use an answer of the service that has died: it decides no more.
         is_left = status == Status.LOCAL_RECOVERY.value and timing.service != RECOVERY_SERVICE
         return "" if is_left else timing.service
 
