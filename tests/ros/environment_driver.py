@@ -23,8 +23,7 @@ from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 
 from holdfast.errors import EnvironmentFailedError
-from holdfast_ros.ros2_connections import Connections
-from holdfast_ros.ros2_environment import Ros2Environment
+from holdfast_ros.ros2_environment import Connections, Ros2Environment
 
 
 def _plain(value: Any) -> Any:

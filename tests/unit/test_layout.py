@@ -43,7 +43,6 @@ WITHOUT_TESTS = {
     "tuning/findings": WRONG_PROBLEMS,
     "tuning/sensor_check": WRONG_PROBLEMS,
     "tuning/trial_check": WRONG_PROBLEMS,
-    "ros/ros2_connections": "needs ROS 2; tests/ros/test_ros2_environment.py",
 }
 """Modules of the product that no test is named after, and why."""
 

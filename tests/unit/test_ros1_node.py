@@ -17,13 +17,13 @@ import pytest
 from tests.ports import free_port
 
 from holdfast_ros import ros1_node
-from holdfast_ros.ros1_environment import RosEnvironment, ServiceType
+from holdfast_ros.ros1_environment import RosEnvironment, RosType
 from holdfast_ros.ros1_node import RosNode
 from ros1_master_guard.headers import encode_header
 from ros1_master_guard.ros1_calls import Connection, HttpHead
 
 PATIENCE_S = 30.0
-TYPE = ServiceType("std_srvs/Trigger", "937c9679a518e3a18d831e57125ea522")
+TYPE = RosType("std_srvs/Trigger", "937c9679a518e3a18d831e57125ea522")
 FAULT = {"faultCode": 1, "faultString": "no"}
 
 
@@ -208,7 +208,7 @@ async def test_what_is_no_question_to_a_node_is_answered_with_a_fault(
     master: Master, content: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     node = RosNode("cloud", around(master))
-    node.publish("topic", ros1_node.TopicType("std_msgs/String", "0" * 32, "string data"))
+    node.publish("topic", RosType("std_msgs/String", "0" * 32, "string data"))
     await node.start(0.0)
     host, port = node._uri.removeprefix("http://").rstrip("/").split(":")
     reader, writer = await asyncio.open_connection(host, int(port))
@@ -325,7 +325,7 @@ class Deaf:
 
 
 def test_what_waits_for_a_subscriber_has_a_bound() -> None:
-    topic = ros1_node.Topic("/topic", ros1_node.TopicType("a/B", "0" * 32, ""))
+    topic = ros1_node.Topic("/topic", RosType("a/B", "0" * 32, ""))
     deaf = Deaf()
     topic.add(cast(asyncio.StreamWriter, deaf))
     for _ in range(300):

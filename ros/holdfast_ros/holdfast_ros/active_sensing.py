@@ -1,11 +1,7 @@
 """Active sensing as one stateless, typed service with three kinds of request.
 
-The first implementation had a service ``cloud_active_sensing`` in the cloud and another one,
-``cloud_active_sensing_recovery``, on the robot. Each kept the belief, so a robot that changed the
-service lost it. Here each request brings the planning state and each answer returns it, so any
-service can answer any request.
-
-This module has the service without a wire: requests and answers as Python objects.
+Each request brings the planning state and each answer returns it, so any service can answer any
+request. This module has the service without a wire: requests and answers as Python objects.
 ``srv/ActiveSensing.srv`` of ``holdfast_interfaces`` defines them as messages, field by field.
 """
 
@@ -13,7 +9,7 @@ from __future__ import annotations
 
 import enum
 import hashlib
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -26,44 +22,26 @@ from holdfast.planning.planner import Planner, PlanningState
 from holdfast.robot.environment import is_no_reading
 from holdfast.robot.session_configuration import session_configuration_of
 
-__all__ = [
-    "ANOTHER_MAY_ANSWER",
-    "ActiveSensing",
-    "DecisionAnswer",
-    "DecisionRequest",
-    "ErrorCode",
-    "RequestKind",
-    "configuration_digest",
-]
-
-
 _MAX_MESSAGE = 2000
-_NO_ENTROPIES = np.empty(0)
+_NONE = np.empty(0)
 
 
 class RequestKind(enum.IntEnum):
     """The kind of a request."""
 
-    INITIALIZE = 0
-    """Return the state that a trial begins with."""
-    CHOOSE_SENSING_ACTION = 1
-    """Choose what to sense."""
-    CHOOSE_TASK_ACTIONS = 2
-    """Choose the task actions after an observation."""
+    INITIALIZE = 0  # return the state that a trial begins with
+    CHOOSE_SENSING_ACTION = 1  # choose what to sense
+    CHOOSE_TASK_ACTIONS = 2  # choose the task actions after an observation
 
 
 class ErrorCode(enum.IntEnum):
     """Why there is no answer."""
 
     OK = 0
-    BAD_REQUEST = 1
-    """The request is invalid for every service."""
-    OTHER_CONFIGURATION = 2
-    """This service plans with another configuration or other code."""
-    PROBLEM_FAILED = 3
-    """The problem's own code has raised an error."""
-    BUSY = 4
-    """Too many requests: another service may answer now, or this one later."""
+    BAD_REQUEST = 1  # the request is invalid for every service
+    OTHER_CONFIGURATION = 2  # this service plans with another configuration or other code
+    PROBLEM_FAILED = 3  # the problem's own code has raised an error
+    BUSY = 4  # too many requests: another service may answer now, or this one later
 
 
 ANOTHER_MAY_ANSWER = (ErrorCode.OTHER_CONFIGURATION, ErrorCode.BUSY)
@@ -71,57 +49,27 @@ ANOTHER_MAY_ANSWER = (ErrorCode.OTHER_CONFIGURATION, ErrorCode.BUSY)
 
 
 class DecisionRequest(NamedTuple):
-    """A request; fields that its kind does not need keep their defaults.
-
-    Attributes
-    ----------
-    kind : int
-        One of :class:`RequestKind`.
-    configuration : str
-        Digest of the required configuration; empty accepts the service's.
-    seed, trial : int
-        Of the trial that begins.
-    state : PlanningState or None
-        None only for INITIALIZE.
-    sensing_action : int
-        The sensing action that was performed.
-    observation : array of shape (observation_size,)
-        Its result; NaN in every component is no reading.
-    """
+    """A request; fields that its kind does not need keep their defaults."""
 
     kind: int
-    configuration: str = ""
+    configuration: str = ""  # digest of the required one; empty accepts the service's
     seed: int = 0
     trial: int = 0
     state: PlanningState | None = None
-    sensing_action: int = 0
-    observation: FloatArray = _NO_ENTROPIES
+    sensing_action: int = 0  # that was performed
+    observation: FloatArray = _NONE  # what it has shown; NaN in every component: no reading
 
 
 class DecisionAnswer(NamedTuple):
-    """An answer; fields that its request did not ask for are empty.
-
-    Attributes
-    ----------
-    message : str
-        Why there is no answer, in words.
-    configuration : str
-        Digest of the service's configuration.
-    state : PlanningState or None
-        For the next request; None if there is no answer.
-    entropies : array of shape (J,)
-        Expected entropy after each sensing action, in nats; empty if the selector has none.
-    task_actions : array of shape (n, action_size)
-        Up to the next sensing step, in order.
-    """
+    """An answer; fields that its request did not ask for are empty."""
 
     error: ErrorCode
-    message: str
+    message: str  # why there is no answer
     configuration: str
-    state: PlanningState | None = None
+    state: PlanningState | None = None  # for the next request
     sensing_action: int = 0
-    entropies: FloatArray = _NO_ENTROPIES
-    task_actions: FloatArray = np.empty((0, 0))
+    entropies: FloatArray = _NONE  # expected after each sensing action, in nats
+    task_actions: FloatArray = np.empty((0, 0))  # one a row, up to the next sensing step
 
 
 def configuration_digest(configuration: Configuration) -> str:
@@ -160,8 +108,8 @@ class ActiveSensing:
             return self._answer(request)
         except HoldfastError as error:
             # Only the author can fix a problem that breaks its contract.
-            is_problem = isinstance(error, ProblemError)
-            code = ErrorCode.PROBLEM_FAILED if is_problem else ErrorCode.BAD_REQUEST
+            of_problem = isinstance(error, ProblemError)
+            code = ErrorCode.PROBLEM_FAILED if of_problem else ErrorCode.BAD_REQUEST
             return self.refusal(code, str(error))
         except Exception as error:
             account = account_of_user_error(error, self._problem_name)
@@ -172,14 +120,12 @@ class ActiveSensing:
     def _answer(self, request: DecisionRequest) -> DecisionAnswer:
         planner = self._planner
         if request.kind == RequestKind.INITIALIZE:
-            state = planner.init(request.seed, request.trial)
-            return DecisionAnswer(ErrorCode.OK, "", self.configuration, state)
+            return self._ok(planner.init(request.seed, request.trial))
         if request.kind not in (RequestKind.CHOOSE_SENSING_ACTION, RequestKind.CHOOSE_TASK_ACTIONS):
             known = ", ".join(f"{kind.value} {kind.name}" for kind in RequestKind)
             raise InvalidValueError(f"kind {request.kind}: there are {known}")
-        if request.state is None:
+        if (state := request.state) is None:
             raise InvalidValueError("state: there are no particles in it")
-        state = request.state
         planner.check(state)
         needs_sensing = planner.needs_sensing(state)
         if request.kind == RequestKind.CHOOSE_SENSING_ACTION:
@@ -188,8 +134,8 @@ class ActiveSensing:
                     f"step {state.step} needs no sensing action; ask for CHOOSE_TASK_ACTIONS"
                 )
             chosen, info = planner.choose_sensing_action(state)
-            entropies = _NO_ENTROPIES if info.entropies is None else info.entropies
-            return DecisionAnswer(ErrorCode.OK, "", self.configuration, state, chosen, entropies)
+            entropies = _NONE if info.entropies is None else info.entropies
+            return self._ok(state, sensing_action=chosen, entropies=entropies)
         if needs_sensing:
             shown = request.observation
             chosen_not_to = request.sensing_action == planner.no_sensing and not shown.size
@@ -200,10 +146,8 @@ class ActiveSensing:
                 f"observation of {request.observation.size} values: step {state.step} needs none"
             )
         actions, ahead = planner.plan_until_sensing(state, self._max_actions)
-        return DecisionAnswer(
-            ErrorCode.OK,
-            "",
-            self.configuration,
-            ahead,
-            task_actions=np.reshape(actions, (len(actions), planner.problem.action_size)),
-        )
+        shape = len(actions), planner.problem.action_size
+        return self._ok(ahead, task_actions=np.reshape(actions, shape))
+
+    def _ok(self, state: PlanningState, **fields: Any) -> DecisionAnswer:
+        return DecisionAnswer(ErrorCode.OK, "", self.configuration, state, **fields)

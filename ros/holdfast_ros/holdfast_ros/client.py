@@ -28,8 +28,6 @@ from holdfast_ros.active_sensing import (
 )
 from holdfast_ros.loop_thread import LoopThread
 
-__all__ = ["ActiveSensingClient", "DecisionService", "log_event"]
-
 _AGAIN_S = 0.05
 """A service that failed at once is not asked again before this time has passed."""
 
@@ -37,20 +35,12 @@ _MAX_DEADLINE_S = 3600.0
 
 
 class DecisionService(Protocol):
-    """A client of one service."""
+    """A client of one service; ``name`` is the service's, for messages."""
 
-    @property
-    def name(self) -> str:
-        """Name of the service, for messages."""
+    name: str
 
     async def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
-        """Ask, and wait at most ``deadline_s`` for the answer.
-
-        Raises
-        ------
-        TransportError
-            If there is no answer; the message gives the reason.
-        """
+        """Ask, and wait at most ``deadline_s``; raise TransportError if there is no answer."""
 
 
 class _Asker:
@@ -100,29 +90,11 @@ class _Asker:
 class ActiveSensingClient:
     """Asks the cloud, and the recovery service when the cloud does not answer.
 
-    Parameters
-    ----------
-    cloud, recovery : DecisionService
-        Whom to ask.
-    thread : LoopThread
-        Where they are asked; closed with the client.
-    deadline_s : float
-        The cloud's time for an answer. After a miss it decides again once it answers within this
-        time. The recovery service, the last resort, gets more with each request that takes longer.
-    on_event : callable or None
-        Gets each change as ``on_event(name, **fields)``, on that thread: ``status`` (``status``,
-        ``reason``) and ``holding`` (``reason``) while no service answers. By default they are
-        logged as warnings of ``rosout.holdfast_ros``.
-
-    Attributes
-    ----------
-    decided_by : str
-        Name of the service whose answer was returned last.
-
-    Raises
-    ------
-    InvalidValueError
-        If ``deadline_s`` is not above 0 and at most 3600.
+    Both are asked on ``thread``, which is closed with the client. The cloud has ``deadline_s``, at
+    most an hour, for an answer. ``on_event`` gets each change as ``on_event(name, **fields)``, on
+    that thread: ``status`` (``status``, ``reason``) and ``holding`` (``reason``) while no service
+    answers. By default they are logged as warnings of ``rosout.holdfast_ros``. ``decided_by`` is
+    the name of the service whose answer was returned last.
     """
 
     def __init__(
@@ -141,7 +113,7 @@ class ActiveSensingClient:
         self.decided_by = ""
         self._thread = thread
         self._deadline_s = deadline_s
-        self._on_event = on_event or log_event
+        self._on_event = on_event or _log_event
         self._number = 0
         self._cloud = _Asker(cloud, deadline_s)
         self._recovery = _Asker(recovery, deadline_s, is_last_resort=True)
@@ -157,19 +129,10 @@ class ActiveSensingClient:
         self._thread.close(self._deadline_s)
 
     def decide(self, request: DecisionRequest, give_up_s: float | None = None) -> DecisionAnswer:
-        """Return a service's answer; while none answers, wait.
+        """Return a service's answer; while none answers, wait, at most ``give_up_s`` if given.
 
-        Parameters
-        ----------
-        give_up_s : float or None
-            Longest wait; None waits until a service answers.
-
-        Raises
-        ------
-        InvalidValueError
-            If the request is invalid or the problem failed; the message gives the reason.
-        TransportError
-            If no service has answered in time, or this is closed.
+        Raises InvalidValueError if the request is invalid or the problem failed; the message gives
+        the reason. Raises TransportError if no service has answered in time, or this is closed.
         """
         return self._thread.run(self._decide(request, give_up_s))
 
@@ -185,7 +148,8 @@ class ActiveSensingClient:
             if give_up_s is not None and waited >= give_up_s:
                 raise TransportError(f"nobody has answered in {give_up_s:g} s: {self._reasons()}")
             if self._cloud_decides and waited >= self._deadline_s:
-                self._cloud_is_lost(f"no answer in {self._deadline_s:g} s")
+                self._cloud.reason = f"no answer in {self._deadline_s:g} s"
+                self._change(Cause.CLOUD_LOST, self._cloud.reason)
             if waited >= 2 * self._deadline_s and not held:
                 held = True
                 self._on_event("holding", reason=self._reasons())
@@ -211,10 +175,10 @@ class ActiveSensingClient:
         answer, asker.task = asker.task.result(), None
         is_wanted = asker.number == self._number
         if asker is self._cloud:
-            if answer is None and self._cloud_decides:
-                self._cloud_is_lost(asker.reason)
             in_time = is_wanted or asker.took_s <= self._deadline_s
-            if answer is not None and in_time and not self._cloud_decides:
+            if answer is None and self._cloud_decides:
+                self._change(Cause.CLOUD_LOST, asker.reason)
+            elif answer is not None and in_time and not self._cloud_decides:
                 self._change(Cause.CLOUD_ANSWERED, "")
         if answer is None or not is_wanted:
             return None
@@ -222,10 +186,6 @@ class ActiveSensingClient:
         if answer.error is not ErrorCode.OK:
             raise InvalidValueError(f"{self.decided_by}: {answer.error.name}: {answer.message}")
         return answer
-
-    def _cloud_is_lost(self, reason: str) -> None:
-        self._cloud.reason = reason
-        self._change(Cause.CLOUD_LOST, reason)
 
     def _change(self, cause: Cause, reason: str) -> None:
         self.status = next_status(self.status, cause)
@@ -238,8 +198,7 @@ class ActiveSensingClient:
         )
 
 
-def log_event(name: str, **fields: object) -> None:
-    """Log an event, by default as a line on the standard error."""
+def _log_event(name: str, **fields: object) -> None:
     words = " ".join(f"{key}={value}" for key, value in fields.items() if value)
     # A node of rospy shows what is below rosout, on its terminal and in /rosout.
     logging.getLogger("rosout.holdfast_ros").warning("%s: %s", name, words)

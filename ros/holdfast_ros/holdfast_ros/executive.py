@@ -2,7 +2,7 @@
 
 Such a program calls; it does not want to be called. So this environment's ``perform_sensing`` and
 ``perform`` publish the decision, and wait until a call of :meth:`DecisionHandover.call` reports its
-outcome. The run is like any other: journalled, resumable, with services that may die.
+outcome.
 
 Calls may be repeated after a lost reply or a crash. So a decision's number follows from its place
 in the trial: the sensing action of step t is number 2 t + 1, the task action is 2 t + 2. A resumed
@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast.errors import EnvironmentFailedError, InvalidValueError
+from holdfast.errors import EnvironmentFailedError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.outcome import Done
 from holdfast.problems.problem import Problem
@@ -32,30 +32,21 @@ class DecideCode(enum.IntEnum):
     """The result of a call."""
 
     OK = 0
-    HOLDING = 1
-    """There is no decision yet: repeat the call."""
-    FINISHED = 2
-    """All trials are finished."""
-    BAD_REQUEST = 3
-    """The reported outcome was refused; the decision is still due."""
-    INACTIVE = 4
-    """No run is active."""
-    ENDED = 5
-    """The run has ended early."""
+    HOLDING = 1  # there is no decision yet: repeat the call
+    FINISHED = 2  # all trials are finished
+    BAD_REQUEST = 3  # the reported outcome was refused; the decision is still due
+    INACTIVE = 4  # no run is active
+    ENDED = 5  # the run has ended early
 
 
 class DueDecision(NamedTuple):
-    """A decision whose outcome is awaited; ``trial`` and ``number`` identify it.
-
-    ``sensing_action`` is None for a task action, and ``task_action``, of shape ``(action_size,)``,
-    is empty for a sensing action. ``step`` counts the task actions before it.
-    """
+    """A decision whose outcome is awaited; ``trial`` and ``number`` identify it."""
 
     trial: int
     number: int
-    step: int
-    sensing_action: int | None
-    task_action: FloatArray = _NO_NUMBERS
+    step: int  # task actions before it
+    sensing_action: int | None  # None for a task action
+    task_action: FloatArray = _NO_NUMBERS  # of shape (action_size,); empty for a sensing action
 
 
 class DecideRequest(NamedTuple):
@@ -69,7 +60,7 @@ class DecideRequest(NamedTuple):
 
 
 class DecideReply(NamedTuple):
-    """The reply to a call; the message says why there is no decision."""
+    """The reply to a call."""
 
     code: DecideCode
     message: str = ""
@@ -99,10 +90,7 @@ class DecisionHandover:
             self._changed.notify_all()
 
     def perform(self, due: DueDecision) -> DecideRequest:
-        """Publish a decision and wait for its outcome.
-
-        Raises EnvironmentFailedError if the run ends first.
-        """
+        """Publish a decision and wait for its outcome; raise an error if the run ends first."""
         with self._changed:
             self._answer = None
             if self._end is None:
@@ -115,10 +103,7 @@ class DecisionHandover:
             return answer
 
     def call(self, call: DecideRequest, within_s: float) -> DecideReply:
-        """Take the outcome of a decision, and return the next decision.
-
-        The reply is ``HOLDING`` after ``within_s``.
-        """
+        """Take the outcome of a decision, and return the next one; HOLDING after ``within_s``."""
         deadline = monotonic() + within_s
         named = call.trial, call.number
         with self._changed:
@@ -128,16 +113,13 @@ class DecisionHandover:
                     # An outcome of before was taken; this is a repeated call.
                     if not call.number or named < (due.trial, due.number):
                         return DecideReply(DecideCode.OK, due=due)
-                    try:
-                        self._check(call, due)
-                    except InvalidValueError as error:
-                        return DecideReply(DecideCode.BAD_REQUEST, str(error), due)
+                    if refusal := self._refusal(call, due):
+                        return DecideReply(DecideCode.BAD_REQUEST, refusal, due)
                     self._answer, self._answered, self._due = call, named, None
                     self._changed.notify_all()
                 elif call.number and self._answered not in (None, named):
-                    return DecideReply(
-                        DecideCode.BAD_REQUEST, self._wrong_number(named, self._answered)
-                    )
+                    refusal = self._wrong_number(named, self._answered)
+                    return DecideReply(DecideCode.BAD_REQUEST, refusal)
                 if not self._changed.wait(deadline - monotonic()) and monotonic() >= deadline:
                     return DecideReply(
                         DecideCode.HOLDING, "nothing is decided yet; make the same call again"
@@ -152,39 +134,35 @@ class DecisionHandover:
             "answered, or was last; number 0 asks what is due"
         )
 
-    def _check(self, call: DecideRequest, due: DueDecision) -> None:
-        if (call.trial, call.number) != (due.trial, due.number):
-            raise InvalidValueError(
-                self._wrong_number((call.trial, call.number), (due.trial, due.number))
-            )
+    def _refusal(self, call: DecideRequest, due: DueDecision) -> str:
+        """Return why an outcome cannot be taken; empty if it can."""
+        named, expected = (call.trial, call.number), (due.trial, due.number)
+        shown = call.observation
+        if named != expected:
+            return self._wrong_number(named, expected)
         if call.done not in (False, True, "failed"):
-            raise InvalidValueError(f"done {call.done}: allowed are 0 to 2")
+            return f"done {call.done}: allowed are 0 to 2"
         if call.reward is not None and not np.isfinite(call.reward):
-            raise InvalidValueError(f"reward {call.reward}: must be a finite number")
+            return f"reward {call.reward}: must be a finite number"
         if due.sensing_action is None:
-            if call.observation.size:
-                raise InvalidValueError(
-                    f"observation of {call.observation.size} values: number {due.number} is a task "
-                    "action, of which there is none"
-                )
-            return
+            reason = f"number {due.number} is a task action, of which there is none"
+            return f"observation of {shown.size} values: {reason}" if shown.size else ""
         if call.done is not False:
             said = "that the task has failed" if call.done == "failed" else "that it has succeeded"
-            raise InvalidValueError(
+            return (
                 f"done says {said}: number {due.number} is a sensing action, after which the task "
                 "goes on; say so with the task action that it ended with"
             )
         size = self._sizes[due.sensing_action]
-        if call.observation.size < 1 or size not in (None, call.observation.size):
-            raise InvalidValueError(
-                f"observation of {call.observation.size} values: sensing action "
-                f"{due.sensing_action} of {self._problem.name} has {size or 'at least 1'}"
+        if not shown.size or size not in (None, shown.size):
+            return (
+                f"observation of {shown.size} values: sensing action {due.sensing_action} of "
+                f"{self._problem.name} has {size or 'at least 1'}"
             )
-        if not np.isfinite(call.observation).all() and not is_no_reading(call.observation):
-            place = int(np.argmin(np.isfinite(call.observation)))
-            raise InvalidValueError(
-                f"observation[{place}] is {call.observation[place]}: must be a finite number"
-            )
+        if not np.isfinite(shown).all() and not is_no_reading(shown):
+            place = int(np.argmin(np.isfinite(shown)))
+            return f"observation[{place}] is {shown[place]}: must be a finite number"
+        return ""
 
 
 class ExecutiveEnvironment:
@@ -200,16 +178,14 @@ class ExecutiveEnvironment:
 
     def perform_sensing(self, sensing_action: int) -> FloatArray:
         """Have the executive sense."""
-        step = self._step
-        due = DueDecision(self._trial, 2 * step + 1, step, sensing_action)
+        due = DueDecision(self._trial, 2 * self._step + 1, self._step, sensing_action)
         return self._executive.perform(due).observation
 
     def perform(self, task_action: FloatArray) -> float | None:
         """Have the executive act."""
-        step = self._step
-        due = DueDecision(self._trial, 2 * step + 2, step, None, task_action)
+        due = DueDecision(self._trial, 2 * self._step + 2, self._step, None, task_action)
         call = self._executive.perform(due)
-        self._step = step + 1
+        self._step += 1
         self._done = call.done
         return call.reward
 
@@ -220,7 +196,6 @@ class ExecutiveEnvironment:
     def steps_performed(self) -> int:
         """Return how many task actions the journal knows to be performed.
 
-        One that may have begun is handed out again with its number. The executive knows whether it
-        has performed it, and answers without performing it twice.
+        The executive, which is given the next one again, knows whether it has performed that.
         """
         return self._step

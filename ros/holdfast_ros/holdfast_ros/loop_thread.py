@@ -51,13 +51,5 @@ class LoopThread:
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
-        try:
-            self._loop.run_forever()
-            tasks = asyncio.all_tasks(self._loop)
-            for task in tasks:
-                task.cancel()
-            for waits in (asyncio.gather(*tasks, return_exceptions=True), asyncio.sleep(0)):
-                self._loop.run_until_complete(waits)  # the last is for connections that just closed
-        finally:
-            self._loop.close()
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:  # its end cancels all tasks
+            runner.get_loop().run_forever()

@@ -27,26 +27,13 @@ if TYPE_CHECKING:
 
     from holdfast_ros.active_sensing import ActiveSensing
 
-__all__ = [
-    "MAX_BYTES",
-    "SERVICE",
-    "answer_message",
-    "decode_answer",
-    "decode_request",
-    "encode_answer",
-    "encode_request",
-    "md5_sum",
-    "typestore",
-]
-
 SERVICE = "holdfast_interfaces/srv/ActiveSensing"
-"""The service's type."""
-
 MAX_BYTES = 16_000_000
 """Largest message; a state of 100,000 particles in nine coordinates has half of it."""
 
-_PACKAGE = "holdfast_interfaces"
-_MESSAGES = ("Belief", "PlanningState")
+_BELIEF, _STATE = "holdfast_interfaces/msg/Belief", "holdfast_interfaces/msg/PlanningState"
+_REQUEST, _RESPONSE = f"{SERVICE}_Request", f"{SERVICE}_Response"
+_NO_STATE = PlanningState(0, 0, 0, 0, False, Belief(np.empty((0, 0)), np.empty(0)))
 
 
 @functools.cache
@@ -61,17 +48,19 @@ def typestore() -> Typestore:
         raise InvalidValueError(
             f"ROS messages need rosbags: pip install rosbags ({error})"
         ) from error
-    folder = files("holdfast_ros") / "interfaces"
+
+    def definition(name: str, kind: str) -> str:
+        place = files("holdfast_ros") / "interfaces" / kind / f"{name.rpartition('/')[2]}.{kind}"
+        return place.read_text(encoding="utf-8")
+
     types: Typesdict = {}
-    for name in _MESSAGES:
-        text = (folder / "msg" / f"{name}.msg").read_text(encoding="utf-8")
-        types |= get_types_from_msg(text, f"{_PACKAGE}/msg/{name}")
-    name = SERVICE.rpartition("/")[2]
-    text = (folder / "srv" / f"{name}.srv").read_text(encoding="utf-8")
-    for part, definition in zip(("Request", "Response"), text.split("\n---\n"), strict=True):
+    for name in (_BELIEF, _STATE):
+        types |= get_types_from_msg(definition(name, "msg"), name)
+    parts = definition(SERVICE, "srv").split("\n---\n")
+    for name, text in zip((_REQUEST, _RESPONSE), parts, strict=True):
         # Parsed as a message, so that a name without a package means one of the service's own.
-        message = f"{_PACKAGE}/msg/{name}_{part}"
-        types[f"{SERVICE}_{part}"] = get_types_from_msg(definition, message)[message]
+        message = name.replace("/srv/", "/msg/")
+        types[name] = get_types_from_msg(text, message)[message]
     store = get_typestore(Stores.EMPTY)
     store.register(types)
     return store
@@ -79,8 +68,8 @@ def typestore() -> Typestore:
 
 def md5_sum() -> str:
     """Return the MD5 sum by which ROS 1 knows the service."""
-    texts = (_hashed_text(f"{SERVICE}_{part}") for part in ("Request", "Response"))
-    return hashlib.md5("".join(texts).encode(), usedforsecurity=False).hexdigest()
+    text = _hashed_text(_REQUEST) + _hashed_text(_RESPONSE)
+    return hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()
 
 
 def _hashed_text(name: str) -> str:
@@ -97,98 +86,57 @@ def _hashed_text(name: str) -> str:
 
 
 def encode_request(request: DecisionRequest) -> bytes:
-    """Return a request as a message.
-
-    Raises InvalidValueError if a number does not fit into its field, or the text is none.
-    """
-    types = typestore().types
-    message = types[f"{SERVICE}_Request"](
-        kind=_whole("kind", request.kind, 0, 8),
-        configuration=request.configuration,
-        seed=_whole("seed", request.seed, 63, 63),
-        trial=_whole("trial", request.trial, 0, 32),
-        state=_state_message(request.state),
-        sensing_action=_whole("sensing_action", request.sensing_action, 0, 32),
-        observation=_flat(request.observation),
-    )
-    return _encode(message, "Request")
+    """Return a request as a message; raise InvalidValueError if a field cannot hold its value."""
+    fields = request._asdict() | {"state": _state_message(request.state)}
+    return _encode(_message(_REQUEST, fields | {"observation": _flat(request.observation)}))
 
 
 def decode_request(data: bytes | memoryview) -> DecisionRequest:
-    """Return the request that a message has.
-
-    Raises InvalidValueError if it is no message of this type. Raises CheckpointError if its state
-    is none.
-    """
-    message = _decode(data, "Request")
+    """Return the request that a message has; raise HoldfastError if it is invalid."""
+    fields = _decode(data, _REQUEST)
+    observation = _array(fields["observation"])
     return DecisionRequest(
-        kind=message.kind,
-        configuration=message.configuration,
-        seed=message.seed,
-        trial=message.trial,
-        state=_state(message.state),
-        sensing_action=message.sensing_action,
-        observation=_array(message.observation),
+        **fields | {"state": _state(fields["state"]), "observation": observation}
     )
 
 
 def encode_answer(answer: DecisionAnswer) -> bytes:
-    """Return an answer as a message.
-
-    Raises InvalidValueError if a number does not fit into its field, or a text is none.
-    """
-    types = typestore().types
+    """Return an answer as a message; raise InvalidValueError if a field cannot hold its value."""
     actions = answer.task_actions
-    message = types[f"{SERVICE}_Response"](
-        error=_whole("error", answer.error, 0, 8),
-        message=answer.message,
-        configuration=answer.configuration,
-        state=_state_message(answer.state),
-        sensing_action=_whole("sensing_action", answer.sensing_action, 0, 32),
-        entropies=_flat(answer.entropies),
-        action_size=actions.shape[1] if len(actions) else 0,
-        task_actions=_flat(actions),
-    )
-    return _encode(message, "Response")
+    fields = answer._asdict() | {
+        "state": _state_message(answer.state),
+        "entropies": _flat(answer.entropies),
+        "action_size": actions.shape[1] if len(actions) else 0,
+        "task_actions": _flat(actions),
+    }
+    return _encode(_message(_RESPONSE, fields))
 
 
 def decode_answer(data: bytes | memoryview) -> DecisionAnswer:
-    """Return the answer that a message has.
-
-    Raises InvalidValueError if it is no message of this type, or its fields contradict each other.
-    Raises CheckpointError if its state is none.
-    """
-    message = _decode(data, "Response")
+    """Return the answer that a message has; raise HoldfastError if it is invalid."""
+    fields = _decode(data, _RESPONSE)
     try:
-        error = ErrorCode(message.error)
+        error = ErrorCode(fields["error"])
     except ValueError:
         known = ", ".join(f"{code.value} {code.name}" for code in ErrorCode)
-        raise InvalidValueError(f"error {message.error}: there are {known}") from None
-    actions = _array(message.task_actions)
-    size = message.action_size
+        raise InvalidValueError(f"error {fields['error']}: there are {known}") from None
+    actions, size = _array(fields["task_actions"]), fields.pop("action_size")
     if actions.size and (not size or actions.size % size):
         raise InvalidValueError(
             f"task_actions has {actions.size} numbers: they must be actions of action_size {size}"
         )
-    return DecisionAnswer(
-        error=error,
-        message=message.message,
-        configuration=message.configuration,
-        state=_state(message.state),
-        sensing_action=message.sensing_action,
-        entropies=_array(message.entropies),
-        task_actions=actions.reshape(-1, size) if actions.size else np.empty((0, size)),
-    )
+    fields["error"], fields["state"] = error, _state(fields["state"])
+    fields["entropies"] = _array(fields["entropies"])
+    fields["task_actions"] = actions.reshape(-1, size) if size else np.empty((0, 0))
+    return DecisionAnswer(**fields)
 
 
 def answer_message(service: ActiveSensing, request: bytes) -> bytes:
     """Have a service answer a request, both as messages; every failure is an answer, too."""
     try:
-        decoded = decode_request(request)
+        answer = service.answer(decode_request(request))
     except HoldfastError as error:
         answer = service.refusal(ErrorCode.BAD_REQUEST, str(error))
-    else:
-        answer = service.answer(decoded)
     try:
         return encode_answer(answer)
     except HoldfastError as error:
@@ -196,26 +144,16 @@ def answer_message(service: ActiveSensing, request: bytes) -> bytes:
 
 
 def _state_message(state: PlanningState | None) -> Any:
-    types = typestore().types
-    none = PlanningState(0, 0, 0, 0, False, Belief(np.empty((0, 0)), np.empty(0)))
-    seed, trial, step, stage, sensed, (states, weights) = none if state is None else state
-    return types[f"{_PACKAGE}/msg/PlanningState"](
-        seed=_whole("state.seed", seed, 63, 63),
-        trial=_whole("state.trial", trial, 0, 32),
-        step=_whole("state.step", step, 0, 32),
-        stage=_whole("state.stage", stage, 0, 32),
-        sensed=bool(sensed),
-        belief=types[f"{_PACKAGE}/msg/Belief"](
-            state_size=states.shape[1], states=_flat(states), weights=_flat(weights)
-        ),
-    )
+    fields = (_NO_STATE if state is None else state)._asdict()
+    states, weights = fields["belief"]
+    belief = {"state_size": states.shape[1], "states": _flat(states), "weights": _flat(weights)}
+    return _message(_STATE, fields | {"belief": _message(_BELIEF, belief)}, "state.")
 
 
 def _state(message: Any) -> PlanningState | None:
     """Return the state that a message has, or None if it has no particles.
 
-    Raises CheckpointError if this is no state: numbers that are missing or not finite, weights that
-    are negative or do not sum to 1, a negative seed.
+    A state from outside must pass the checks of a checkpoint, else this raises CheckpointError.
     """
     belief = message.belief
     states, weights, size = _array(belief.states), _array(belief.weights), belief.state_size
@@ -228,40 +166,49 @@ def _state(message: Any) -> PlanningState | None:
         )
     head = message.seed, message.trial, message.step, message.stage, bool(message.sensed)
     state = PlanningState(*head, Belief(states.reshape(weights.size, size), weights))
-    # A state from outside must pass the checks of a checkpoint.
     return decode_checkpoint(encode_checkpoint(state))
 
 
-def _encode(message: Any, part: str) -> bytes:
+def _message(name: str, values: dict[str, Any], path: str = "") -> Any:
+    """Return a message with these fields' values; errors name a field with ``path`` before it."""
+    store = typestore()
+    fields = {}
+    for field, (_, kind) in store.fielddefs[name][1]:
+        fields[field] = values[field]
+        if kind[0] in ("uint8", "uint32", "int64"):
+            limits = np.iinfo(kind[0])
+            fields[field] = int(values[field])
+            if not limits.min <= fields[field] <= limits.max:
+                raise InvalidValueError(
+                    f"{path}{field} {values[field]}: it must be from {limits.min} to {limits.max}"
+                )
+    return store.types[name](**fields)
+
+
+def _encode(message: Any) -> bytes:
     try:
-        data = bytes(typestore().serialize_ros1(message, f"{SERVICE}_{part}"))
+        data = bytes(typestore().serialize_ros1(message, message.__msgtype__))
     except UnicodeEncodeError as error:
-        raise InvalidValueError(f"{part}: a text in it is none: {error}") from error
-    if len(data) > MAX_BYTES:
-        raise InvalidValueError(f"{part} of {len(data)} bytes: at most {MAX_BYTES} are allowed")
+        raise InvalidValueError(f"{message.__msgtype__}: a text in it is none: {error}") from error
+    _require_size(data, message.__msgtype__)
     return data
 
 
-def _decode(data: bytes | memoryview, part: str) -> Any:
-    if len(data) > MAX_BYTES:
-        raise InvalidValueError(f"{part} of {len(data)} bytes: at most {MAX_BYTES} are allowed")
+def _decode(data: bytes | memoryview, name: str) -> dict[str, Any]:
+    _require_size(data, name)
     try:
-        return typestore().deserialize_ros1(data, f"{SERVICE}_{part}")
-    except HoldfastError:
-        raise
+        message = typestore().deserialize_ros1(data, name)
+        return {field: getattr(message, field) for field, _ in typestore().fielddefs[name][1]}
     except Exception as error:
         # The generated code checks nothing; invalid bytes raise many kinds of errors.
         raise InvalidValueError(
-            f"{len(data)} bytes are no {SERVICE}_{part}: {type(error).__name__} {error}".rstrip()
+            f"{len(data)} bytes are no {name}: {type(error).__name__} {error}".rstrip()
         ) from error
 
 
-def _whole(name: str, value: int, negative_bits: int, bits: int) -> int:
-    """Return a whole number that fits into a field of so many bits below and above zero."""
-    least, most = -(2**negative_bits) if negative_bits else 0, 2**bits - 1
-    if not least <= value <= most:
-        raise InvalidValueError(f"{name} {value}: it must be from {least} to {most}")
-    return int(value)
+def _require_size(data: bytes | memoryview, name: str) -> None:
+    if len(data) > MAX_BYTES:
+        raise InvalidValueError(f"{name} of {len(data)} bytes: at most {MAX_BYTES} are allowed")
 
 
 def _flat(array: npt.ArrayLike) -> FloatArray:

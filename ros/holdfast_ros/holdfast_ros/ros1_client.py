@@ -16,14 +16,14 @@ from collections.abc import Callable
 from typing import Final
 
 from holdfast.errors import TransportError
-from holdfast.protocol.status import Status
+from holdfast.protocol.status import Cause, Status
 from holdfast.runtime.addresses import system_words
 from holdfast_ros.active_sensing import DecisionAnswer, DecisionRequest
-from holdfast_ros.client import ActiveSensingClient, log_event
+from holdfast_ros.client import ActiveSensingClient
 from holdfast_ros.loop_thread import LoopThread
 from holdfast_ros.messages import MAX_BYTES, decode_answer, encode_request, md5_sum
-from holdfast_ros.ros1_environment import RosEnvironment, ServiceType
-from holdfast_ros.ros1_node import RosNode, TopicType
+from holdfast_ros.ros1_environment import RosEnvironment, RosType
+from holdfast_ros.ros1_node import RosNode
 from ros1_master_guard.errors import CallError, GoneError, ProtocolError
 from ros1_master_guard.headers import (
     MAX_HEADER_BYTES,
@@ -33,11 +33,6 @@ from ros1_master_guard.headers import (
 )
 from ros1_master_guard.ros1_calls import call, connect, message
 
-__all__ = ["SERVICE_TYPE", "STATUS_WORDS", "Ros1Client", "Ros1Service", "service_type"]
-
-SERVICE_TYPE: Final = "holdfast_interfaces/ActiveSensing"
-"""As ROS 1 writes it."""
-
 STATUS_WORDS: Final = {
     Status.STANDARD: "standard",
     Status.LOCAL_RECOVERY: "local recovery",
@@ -45,56 +40,35 @@ STATUS_WORDS: Final = {
 }
 """The first implementation's spelling of the statuses."""
 
-_LOOKUP_S: Final = 1.0
-"""For the master, where the service is known to have been somewhere."""
-
+_LOOKUP_S: Final = 1.0  # for the master, where the service is known to have been somewhere
 _START_S: Final = 5.0
 _CLOSE_S: Final = 1.0
-
-STATUS_TYPE: Final = TopicType(
+_STATUS_TYPE: Final = RosType(
     "std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n"
 )
 
 
-def service_type() -> ServiceType:
-    """Return the typed service's name and digest in ROS 1."""
-    return ServiceType(SERVICE_TYPE, md5_sum())
+def service_type() -> RosType:
+    """Return the typed service's name, as ROS 1 writes it, and its digest."""
+    return RosType("holdfast_interfaces/ActiveSensing", md5_sum())
 
 
 class Ros1Service:
-    """A client of one service; a :class:`~holdfast_ros.client.DecisionService`.
+    """Asks one service in the name of a node; a :class:`~holdfast_ros.client.DecisionService`.
 
-    Parameters
-    ----------
-    name : str
-        Of the service, such as ``cloud_active_sensing``.
-    ros_environment : RosEnvironment
-        Where the master is.
-    caller : str
-        Name of the asking node.
-
-    Raises
-    ------
-    TransportError
-        If the name is none.
+    Raises TransportError if one of the names is none.
     """
 
     def __init__(self, name: str, ros_environment: RosEnvironment, caller: str) -> None:
         self.name = ros_environment.resolved(name)
         self._master = ros_environment.master
         self._caller = ros_environment.resolved(caller)
-        self._digest = md5_sum()
+        self._type = service_type()
         self._last_uri: str | None = None
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
-        """Ask, and wait at most ``deadline_s`` for the answer.
-
-        Raises
-        ------
-        TransportError
-            If there is no answer; the message gives the reason.
-        """
+        """Ask, and wait at most ``deadline_s``; raise TransportError if there is no answer."""
         asked = encode_message(encode_request(request))
         try:
             async with asyncio.timeout(deadline_s):
@@ -146,15 +120,14 @@ class Ros1Service:
     ) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         uri, where = await self._found(deadline_s)
         try:
-            reader, writer = await connect(uri)
+            reader, writer = self._streams = await connect(uri)
         except GoneError:
             raise TransportError(f"nobody listens at {uri}, where {where}: it is dead") from None
-        self._streams = reader, writer
         fields = {
             "callerid": self._caller,
             "service": self.name,
-            "md5sum": self._digest,
-            "type": SERVICE_TYPE,
+            "md5sum": self._type.digest,
+            "type": self._type.name,
             "persistent": "1",
         }
         writer.write(encode_header(fields))
@@ -167,11 +140,10 @@ class Ros1Service:
     async def _found(self, deadline_s: float) -> tuple[str, str]:
         """Return where the service is, and who says so."""
         within_s = deadline_s if self._last_uri is None else min(deadline_s / 2, _LOOKUP_S)
+        lookup = self._master, "lookupService", self.name
         try:
-            asked = call(
-                *(self._master, "lookupService", self.name), within_s=within_s, caller=self._caller
-            )
-            return str(await asked), "the master says it is"
+            found = await call(*lookup, within_s=within_s, caller=self._caller)
+            return str(found), "the master says it is"
         except GoneError:
             reason = f"there is no master at {self._master}"
         except CallError as error:
@@ -211,13 +183,12 @@ class Ros1Client(ActiveSensingClient):
     ) -> None:
         ros_environment = ros_environment or RosEnvironment.of()
         first, second = (Ros1Service(each, ros_environment, name) for each in (cloud, recovery))
-        super().__init__(first, second, LoopThread("holdfast-ros1"), deadline_s, self._tell)
+        super().__init__(first, second, LoopThread("holdfast-ros1"), deadline_s, on_event)
         self._services = first, second
-        self._own_on_event = on_event or log_event
         self._is_unregistered = False
         self._node = RosNode(name, ros_environment)
-        self._status_topic = self._node.publish(f"{name}/status", STATUS_TYPE)
-        self._publish(Status.STANDARD)
+        self._status_topic = self._node.publish(f"{name}/status", _STATUS_TYPE)
+        self._thread.call(self._publish_status)
         try:
             self._thread.run(self._node.start(), _START_S)
         except BaseException:
@@ -234,11 +205,9 @@ class Ros1Client(ActiveSensingClient):
                 self._thread.call(service.disconnect)
         super().close()
 
-    def _tell(self, name: str, **fields: object) -> None:
-        if name == "status":
-            self._publish(Status(fields["status"]))
-        self._own_on_event(name, **fields)
+    def _change(self, cause: Cause, reason: str) -> None:
+        super()._change(cause, reason)
+        self._publish_status()
 
-    def _publish(self, status: Status) -> None:
-        text = STATUS_WORDS[status].encode()
-        self._thread.call(self._status_topic.send, encode_message(text))
+    def _publish_status(self) -> None:
+        self._status_topic.send(encode_message(STATUS_WORDS[self.status].encode()))

@@ -15,26 +15,18 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 _MAX_NAME = 200
 
 
-class ServiceType(NamedTuple):
-    """A service's type: its name, as in ``std_srvs/Trigger``, and its MD5 digest."""
+class RosType(NamedTuple):
+    """A type by its name, as in ``std_srvs/Trigger``, and MD5 digest; a topic's is defined, too."""
 
     name: str
     digest: str
+    definition: str = ""
 
 
 class RosEnvironment(NamedTuple):
-    """The settings of ROS 1 for this process.
+    """The master's URI, this machine's name for other nodes, and the address at which to listen.
 
-    Attributes
-    ----------
-    master : str
-        URI of the master.
-    host : str
-        Name or address of this machine for other nodes.
-    bind : str
-        The address at which to listen.
-    namespace : str
-        Prefix of names that do not begin with a slash; ends with one.
+    ``namespace`` precedes names that do not begin with a slash, and ends with one.
     """
 
     master: str

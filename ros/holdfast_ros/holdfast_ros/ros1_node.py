@@ -14,12 +14,12 @@ import os
 import socket
 import xmlrpc.client
 from collections.abc import Awaitable, Callable, Iterator, Mapping
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from holdfast.errors import DEFECT, TransportError, defect_fields
 from holdfast.runtime.addresses import host_and_port, why_not_bound
-from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
-from holdfast_ros.ros1_environment import RosEnvironment, ServiceType
+from holdfast_ros.messages import MAX_BYTES
+from holdfast_ros.ros1_environment import RosEnvironment, RosType
 from ros1_master_guard.errors import CallError
 from ros1_master_guard.headers import (
     ANY_TYPE,
@@ -28,66 +28,35 @@ from ros1_master_guard.headers import (
     encode_header,
     encode_message,
 )
-from ros1_master_guard.ros1_calls import (
-    MAX_SHORT_BYTES,
-    Connection,
-    HttpHead,
-    decoded,
-    message,
-)
+from ros1_master_guard.ros1_calls import MAX_SHORT_BYTES, Connection, HttpHead, decoded, message
 
 ServiceHandler = Callable[[bytes], Awaitable[bytes]]
 """Takes a request's bytes and returns the response's."""
 
-MAX_CONNECTIONS: Final = 1024
-"""From clients, subscribers and tools together."""
-
 _OPENING_S: Final = 5.0
-_IDLE_S: Final = 60.0
-"""An XML-RPC connection without a call for this long is closed."""
-
-_REQUEST_S: Final = 10.0
-"""From a request's first byte to its last; a slower caller loses the connection."""
-
-_MASTER_S: Final = 1.0
-"""For one call to the master."""
-
+_IDLE_S: Final = 60.0  # an XML-RPC connection without a call for this long is closed
+_REQUEST_S: Final = 10.0  # from a request's first byte to its last
+_MASTER_S: Final = 1.0  # for one call to the master
 _CHECK_INTERVAL_S: Final = 1.0
-_RETRY_S: Final = 0.1
-"""After the master could not be reached."""
+_RETRY_S: Final = 0.1  # after the master could not be reached
+_MAX_UNREAD_BYTES: Final = 64 << 10
+"""Bound on what waits for a subscriber; further messages are dropped."""
 
 _MAX_CALL_BYTES: Final = 8 << 10
 """An XML-RPC call to a node has some hundred bytes. Parsing takes a microsecond for each of them,
 during which nobody else is served."""
 
-_MAX_UNREAD_BYTES: Final = 64 << 10
-"""Bound on what waits for a subscriber; further messages are dropped."""
-
 _TURNS_TO_BEGIN: Final = 4
 """Turns of the loop until asyncio serves a connection that it has accepted. Before that it is in no
 list of ours, and would stay open."""
 
-_UNKNOWN: Final = -1
-_OK: Final = 1
-
-
-class TopicType(NamedTuple):
-    """A topic's type: its name, its MD5 and its whole definition."""
-
-    name: str
-    digest: str
-    definition: str
-
-
-class _Offer(NamedTuple):
-    type: ServiceType
-    handler: ServiceHandler
+_UNKNOWN, _OK = -1, 1
 
 
 class Topic:
     """A latched topic that this node publishes; made by :meth:`RosNode.publish`."""
 
-    def __init__(self, name: str, type_: TopicType) -> None:
+    def __init__(self, name: str, type_: RosType) -> None:
         self.name = name
         self.type = type_
         self._last: bytes | None = None
@@ -121,17 +90,14 @@ class RosNode:
         self,
         name: str,
         environment: RosEnvironment,
-        *,
         on_shutdown: Callable[[str], None] | None = None,
         on_event: Callable[..., None] | None = None,
-        max_message_bytes: int = DEFAULT_MAX_MESSAGE_BYTES,
     ) -> None:
         self.name = environment.resolved(name)
         self._environment = environment
         self._on_shutdown = on_shutdown
-        self._on_event = on_event
-        self._max_message_bytes = max_message_bytes
-        self._services: dict[str, _Offer] = {}
+        self._on_event = on_event or (lambda _, **__: None)
+        self._services: dict[str, tuple[RosType, ServiceHandler]] = {}
         self._topics: dict[str, Topic] = {}
         self._master = Connection(environment.master, self.name, MAX_SHORT_BYTES)
         self._parsing = asyncio.Lock()
@@ -143,36 +109,34 @@ class RosNode:
         self._is_known = False
         self._master_status: str | None = None
 
-    def offer(self, name: str, type_: ServiceType, handler: ServiceHandler) -> None:
+    def offer(self, name: str, type_: RosType, handler: ServiceHandler) -> None:
         """Offer a service, before the start; the caller and the log get the handler's errors."""
-        self._services[self._environment.resolved(name)] = _Offer(type_, handler)
+        self._services[self._environment.resolved(name)] = type_, handler
 
-    def publish(self, name: str, type_: TopicType) -> Topic:
+    def publish(self, name: str, type_: RosType) -> Topic:
         """Add a topic, before the start; new subscribers get its last message."""
         topic = Topic(self._environment.resolved(name), type_)
         self._topics[topic.name] = topic
         return topic
 
-    async def start(self, within_s: float = 2.0) -> bool:
-        """Listen, and register with the master; return whether the master knows this node.
-
-        After ``within_s`` without an answer, registration goes on in the background.
+    async def start(self, within_s: float = 2.0) -> None:
+        """Listen, and register with the master, after ``within_s`` in the background.
 
         Raises TransportError if it cannot listen.
         """
         environment = self._environment
         try:
-            for serve, limit in (
+            for serve, size in (
                 (self._serve_node, _MAX_CALL_BYTES),
                 (self._serve_tcpros, MAX_HEADER_BYTES),
             ):
-                server = await asyncio.start_server(serve, environment.bind, 0, limit=limit)
-                self._servers.append(server)
+                self._servers.append(
+                    await asyncio.start_server(serve, environment.bind, 0, limit=size)
+                )
         except OSError as error:
             self._stop()
-            raise TransportError(
-                f"cannot listen on {environment.bind}: {why_not_bound(error)}"
-            ) from error
+            reason = f"cannot listen on {environment.bind}: {why_not_bound(error)}"
+            raise TransportError(reason) from error
         ports = [server.sockets[0].getsockname()[1] for server in self._servers]
         self._uri = f"http://{host_and_port(environment.host, ports[0])}/"
         self._port = ports[1]
@@ -180,11 +144,9 @@ class RosNode:
         self._registration = asyncio.create_task(self._stay_registered(registered))
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(registered.wait(), within_s)
-        return self._is_known
 
     async def close(self, within_s: float = 1.0) -> None:
         """Unregister, and end all connections; may be repeated."""
-        registration, self._registration = self._registration, None
         loop = asyncio.get_running_loop()
         for server in self._servers:
             for listening in server.sockets:
@@ -192,15 +154,21 @@ class RosNode:
         for _ in range(_TURNS_TO_BEGIN):
             await asyncio.sleep(0)
         self._stop()
-        tasks = [*self._connections, *([] if registration is None else [registration])]
+        tasks = {*self._connections, *filter(None, [self._registration])}
         for task in tasks:
             task.cancel()
         if tasks:
             await asyncio.wait(tasks, timeout=within_s)
         if self._is_known:
             self._is_known = False
+            calls: list[tuple[str, tuple[object, ...]]] = [
+                ("unregisterService", (self.name, *each)) for each in self._service_uris().items()
+            ]
+            calls += [
+                ("unregisterPublisher", (self.name, name, self._uri)) for name in self._topics
+            ]
             with contextlib.suppress(CallError):
-                await self._master.calls(self._unregistrations(), within_s=within_s)
+                await self._master.calls(calls, within_s=within_s)
         self._master.close()
 
     def _stop(self) -> None:
@@ -210,7 +178,7 @@ class RosNode:
 
     # -- the master --------------------------------------------------------------------------------
 
-    def _uris_of_services(self) -> dict[str, str]:
+    def _service_uris(self) -> dict[str, str]:
         place = host_and_port(self._environment.host, self._port)
         return dict.fromkeys(self._services, f"rosrpc://{place}")
 
@@ -234,44 +202,28 @@ class RosNode:
             await asyncio.sleep(pause_s)
 
     async def _is_known_to_master(self) -> bool:
-        services = self._uris_of_services()
-        lookups = [
-            ("lookupNode", (self.name, self.name)),
-            *(("lookupService", (self.name, name)) for name in services),
-        ]
-        return None not in await self._master.calls(lookups, within_s=_MASTER_S)
+        lookups = [("lookupNode", self.name), *(("lookupService", each) for each in self._services)]
+        calls = [(method, (self.name, name)) for method, name in lookups]
+        return None not in await self._master.calls(calls, within_s=_MASTER_S)
 
     async def _register(self) -> None:
-        calls: list[tuple[str, tuple[object, ...]]] = [
-            ("registerService", (name, uri, self._uri))
-            for name, uri in self._uris_of_services().items()
-        ]
-        calls += [
-            ("registerPublisher", (topic.name, topic.type.name, self._uri))
-            for topic in self._topics.values()
-        ]
-        for method, arguments in calls:
-            await self._master.call(method, *arguments, within_s=_MASTER_S)
-
-    def _unregistrations(self) -> list[tuple[str, tuple[object, ...]]]:
-        return [
-            *(
-                ("unregisterService", (self.name, *each))
-                for each in self._uris_of_services().items()
-            ),
-            *(("unregisterPublisher", (self.name, name, self._uri)) for name in self._topics),
-        ]
+        for name, uri in self._service_uris().items():
+            what = "registerService", name, uri, self._uri
+            await self._master.call(*what, within_s=_MASTER_S)
+        for topic in self._topics.values():
+            what = "registerPublisher", topic.name, topic.type.name, self._uri
+            await self._master.call(*what, within_s=_MASTER_S)
 
     def _report_master(self, status: str, reason: str) -> None:
-        if self._on_event is not None and self._master_status != status:
+        if self._master_status != status:
             self._on_event("ros_master", status=status, reason=reason)
         self._master_status = status
 
     # -- XML-RPC ---------------------------------------------------------------------------------
 
     async def _serve_node(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with self._connected(writer) as has_room:
-            while has_room and await self._serve_request(reader, writer):
+        with self._connected(writer):
+            while await self._serve_request(reader, writer):
                 pass
 
     async def _serve_request(
@@ -338,51 +290,69 @@ class RosNode:
     async def _serve_tcpros(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> None:
-        with self._connected(writer) as has_room:
-            if not has_room:
-                return
+        with self._connected(writer):
             async with asyncio.timeout(_OPENING_S):
                 header = decode_header(await message(reader, MAX_HEADER_BYTES))
-            if "service" in header:
-                await self._serve_calls(header, reader, writer)
-            elif "topic" in header:
-                await self._serve_subscriber(header, reader, writer)
+            service, topic = header.get("service"), header.get("topic")
+            if service in self._services:
+                type_, handler = self._services[service]
+                more = {"request_type": f"{type_.name}Request"}
+                more |= {"response_type": f"{type_.name}Response", "service": service}
+                if self._agreed(header, type_, f"service [{service}]", more, writer):
+                    await self._serve_calls(header, handler, reader, writer)
+            elif topic in self._topics:
+                type_ = self._topics[topic].type
+                more = {"message_definition": type_.definition, "latching": "1", "topic": topic}
+                if self._agreed(header, type_, f"topic [{topic}]", more, writer):
+                    self._topics[topic].add(writer)
+                    try:
+                        await reader.read(1)  # a subscriber sends nothing more until it closes
+                    finally:
+                        self._topics[topic].subscribers.discard(writer)
             else:
-                _refuse(writer, "the header names no service and no topic")
+                reason = "the header names no service and no topic"
+                if service or topic:
+                    verb = "has no service" if service else "does not publish"
+                    reason = f"[{self.name}] {verb} [{service or topic:.200}]"
+                writer.write(encode_header({"error": reason}))
+
+    def _agreed(
+        self,
+        header: Mapping[str, str],
+        type_: RosType,
+        what: str,
+        more: Mapping[str, str],
+        writer: asyncio.StreamWriter,
+    ) -> bool:
+        """Answer a peer's header; return whether the peer expects this type."""
+        digest = header.get("md5sum")
+        agreed = digest in (type_.digest, ANY_TYPE)
+        if agreed:
+            fields = {"callerid": self.name, "type": type_.name, "md5sum": type_.digest, **more}
+        else:
+            reason = f"{what} is of type {type_.name} with MD5 {type_.digest}"
+            fields = {"error": f"{reason}; {digest!r:.60} was asked for"}
+        writer.write(encode_header(fields))
+        return agreed
 
     async def _serve_calls(
-        self, header: Mapping[str, str], reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+        self,
+        header: Mapping[str, str],
+        handler: ServiceHandler,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
     ) -> None:
-        offer = self._services.get(header["service"])
-        if offer is None:
-            _refuse(writer, f"[{self.name}] has no service [{header['service']:.200}]")
-            return
-        if _refuse_other_type(header, offer.type, f"service [{header['service']}]", writer):
-            return
-        fields = {
-            "callerid": self.name,
-            "service": header["service"],
-            "type": offer.type.name,
-            "md5sum": offer.type.digest,
-            "request_type": f"{offer.type.name}Request",
-            "response_type": f"{offer.type.name}Response",
-        }
-        writer.write(encode_header(fields))
-        if header.get("probe") == "1":
-            await writer.drain()
-            return
-        while True:
+        while header.get("probe") != "1":
             # A connection may stay idle between requests.
             first = await reader.readexactly(1)
             async with asyncio.timeout(_REQUEST_S):
-                request = await message(reader, self._max_message_bytes, first)
+                request = await message(reader, MAX_BYTES, first)
             try:
                 # A byte for success, and the message or an error text.
-                answer = b"\1" + encode_message(await offer.handler(request))
+                answer = b"\1" + encode_message(await handler(request))
             except Exception as error:  # noqa: BLE001 - only this request fails
                 reason = f"{type(error).__name__}: {error}"
-                if self._on_event is not None:
-                    self._on_event("ros_request_failed", service=header["service"], reason=reason)
+                self._on_event("ros_request_failed", service=header["service"], reason=reason)
                 text = f"the service has failed: {reason:.500}"
                 answer = b"\0" + encode_message(text.encode())
             writer.write(answer)
@@ -390,75 +360,22 @@ class RosNode:
             if header.get("persistent") != "1":
                 return
 
-    async def _serve_subscriber(
-        self, header: Mapping[str, str], reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> None:
-        topic = self._topics.get(header["topic"])
-        if topic is None:
-            _refuse(writer, f"[{self.name}] does not publish [{header['topic']:.200}]")
-            return
-        if _refuse_other_type(header, topic.type, f"topic [{topic.name}]", writer):
-            return
-        writer.write(
-            encode_header(
-                {
-                    "callerid": self.name,
-                    "topic": topic.name,
-                    "type": topic.type.name,
-                    "md5sum": topic.type.digest,
-                    "message_definition": topic.type.definition,
-                    "latching": "1",
-                }
-            )
-        )
-        topic.add(writer)
-        try:
-            await reader.read(1)  # a subscriber sends nothing more until it closes
-        finally:
-            topic.subscribers.discard(writer)
-
     @contextlib.contextmanager
-    def _connected(self, writer: asyncio.StreamWriter) -> Iterator[bool]:
-        """Count a connection, and close it at the end; yield whether there is room for it."""
+    def _connected(self, writer: asyncio.StreamWriter) -> Iterator[None]:
+        """Keep a connection's task, and close the connection at the end."""
         task = asyncio.current_task()
         assert task is not None
-        has_room = len(self._connections) < MAX_CONNECTIONS
         self._connections.add(task)
         # A connection to a machine that was switched off must end some day.
         stream = writer.get_extra_info("socket")
         stream.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        gone = OSError, EOFError, asyncio.LimitOverrunError, asyncio.CancelledError
         try:
-            yield has_room
-        except (
-            *(OSError, EOFError, ValueError, TypeError),
-            *(TimeoutError, CallError, LookupError),
-            *(asyncio.LimitOverrunError, asyncio.CancelledError),
-        ):
+            yield
+        except (*gone, ValueError, TypeError, LookupError, CallError):
             pass  # the peer is gone, or breaks the protocol
         except Exception as error:  # noqa: BLE001 - what a peer sends may raise anything
-            if self._on_event is not None:
-                self._on_event(DEFECT, **defect_fields(error))
+            self._on_event(DEFECT, **defect_fields(error))
         finally:
             self._connections.discard(task)
             writer.close()
-
-
-def _refuse_other_type(
-    header: Mapping[str, str],
-    type_: ServiceType | TopicType,
-    what: str,
-    writer: asyncio.StreamWriter,
-) -> bool:
-    """Refuse a peer that expects another type; return whether it was refused."""
-    digest = header.get("md5sum")
-    if digest in (type_.digest, ANY_TYPE):
-        return False
-    _refuse(
-        writer,
-        f"{what} is of type {type_.name} with MD5 {type_.digest}; {digest!r:.60} was asked for",
-    )
-    return True
-
-
-def _refuse(writer: asyncio.StreamWriter, reason: str) -> None:
-    writer.write(encode_header({"error": reason}))

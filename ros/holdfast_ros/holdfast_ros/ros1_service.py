@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
@@ -14,7 +15,7 @@ from holdfast.config.loader import Configuration
 from holdfast.errors import TransportError
 from holdfast_ros.active_sensing import ActiveSensing, ErrorCode
 from holdfast_ros.loop_thread import LoopThread
-from holdfast_ros.messages import MAX_BYTES, answer_message, encode_answer
+from holdfast_ros.messages import answer_message, encode_answer
 from holdfast_ros.ros1_client import service_type
 from holdfast_ros.ros1_environment import RosEnvironment
 from holdfast_ros.ros1_node import RosNode
@@ -22,16 +23,13 @@ from holdfast_ros.ros1_node import RosNode
 _START_S = 5.0
 
 MAX_WAITING = 64
-"""Requests that may wait besides the one that is being answered. The next one is refused as busy,
-so that the client can ask another service."""
+"""Requests that may wait besides the one that is being answered, before others are refused."""
 
 
 class Ros1Server:
     """A configuration's typed service in ROS 1, offered by a node of the same name.
 
-    It is an extension of a service's process: another thread than the node's calls its methods.
-
-    Raises TransportError if the name is none.
+    Another thread than the node's calls its methods. Raises TransportError if the name is none.
     """
 
     def __init__(
@@ -63,20 +61,11 @@ class Ros1Server:
         on_event: Callable[..., None] | None = None,
         on_shutdown: Callable[[str], None] | None = None,
     ) -> Mapping[str, str]:
-        """Offer the service; return where.
-
-        ``on_shutdown`` gets the reason when ``rosnode kill``, or the master for a name conflict,
-        ends this node; ``on_event`` is that of a :class:`~holdfast_ros.ros1_node.RosNode`.
+        """Offer the service; return where. The callables are those of a :class:`RosNode`.
 
         Raises TransportError if it cannot listen.
         """
-        self._node = RosNode(
-            self.name,
-            self._ros_environment,
-            on_shutdown=on_shutdown,
-            on_event=on_event,
-            max_message_bytes=MAX_BYTES,
-        )
+        self._node = RosNode(self.name, self._ros_environment, on_shutdown, on_event)
         self._node.offer(self.name, service_type(), self._answer)
         self._loop = LoopThread("holdfast-ros1")
         try:
@@ -98,14 +87,11 @@ class Ros1Server:
     async def _answer(self, request: bytes) -> bytes:
         self._owed += 1  # before it looks whether it may
         try:
-            busy = "" if self._takes_more else "this service ends"
-            if self._owed > MAX_WAITING + 1:
-                busy = f"{MAX_WAITING} requests are waiting already"
-            if busy:
-                return encode_answer(self._answers.refusal(ErrorCode.BUSY, busy))
-            loop = asyncio.get_running_loop()
-            return await loop.run_in_executor(
-                self._decisions, answer_message, self._answers, request
-            )
+            if self._takes_more and self._owed <= MAX_WAITING + 1:
+                work = functools.partial(answer_message, self._answers, request)
+                return await asyncio.get_running_loop().run_in_executor(self._decisions, work)
+            busy = f"{MAX_WAITING} requests are waiting already"
+            reason = busy if self._takes_more else "this service ends"
+            return encode_answer(self._answers.refusal(ErrorCode.BUSY, reason))
         finally:
             self._owed -= 1

@@ -36,8 +36,8 @@ def _between(least: float, most: float, read: Callable[[str], float]) -> Callabl
             if least <= (value := read(text)) <= most:
                 return value
         kind = "whole numbers" if read is int else "numbers"
-        raise argparse.ArgumentTypeError(f"is {text!r:.80}; allowed are {kind} from {least:g} to "
-                                         f"{most:g}")  # fmt: skip
+        allowed = f"allowed are {kind} from {least:g} to {most:g}"
+        raise argparse.ArgumentTypeError(f"is {text!r:.80}; {allowed}")
 
     return checked
 
@@ -49,50 +49,26 @@ def _directory(text: str) -> Path:
 
 
 def _parser(program: str) -> argparse.ArgumentParser:
+    form = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        program,
-        description=_ABOUT,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
+        program, description=_ABOUT, formatter_class=form, allow_abbrev=False
     )
-    parser.add_argument(
-        "--port",
-        metavar="N",
-        type=_between(1, 65_535, int),
-        help="the master's port (default: that of ROS_MASTER_URI, or 11311)",
+    add = parser.add_argument
+    text = "the master's port (default: that of ROS_MASTER_URI, or 11311)"
+    add("--port", metavar="N", type=_between(1, 65_535, int), help=text)
+    text = "a master that has not answered for this long is killed and replaced (default: 3)"
+    add("--silent-s", metavar="S", type=_between(0.5, 3600.0, float), default=3.0, help=text)
+    text = "run /rosout, too, as roscore does"
+    add("--rosout", action=argparse.BooleanOptionalAction, default=True, help=text)
+    text = "ROS's Python, which has rosmaster (default: /usr/bin/python3)"
+    add("--python", metavar="FILE", default="/usr/bin/python3", help=text)
+    text = (
+        "where the master's registrations are written (default: a directory of this user that is "
+        "gone after a restart of the machine)"
     )
-    parser.add_argument(
-        "--silent-s",
-        metavar="S",
-        type=_between(0.5, 3600.0, float),
-        default=3.0,
-        help="a master that has not answered for this long is killed and replaced (default: 3)",
-    )
-    parser.add_argument(
-        "--rosout",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="run /rosout, too, as roscore does",
-    )
-    parser.add_argument(
-        "--python",
-        metavar="FILE",
-        default="/usr/bin/python3",
-        help="ROS's Python, which has rosmaster (default: /usr/bin/python3)",
-    )
-    parser.add_argument(
-        "--directory",
-        metavar="DIR",
-        type=_directory,
-        help="where the master's registrations are written (default: a directory of this user that "
-        "is gone after a restart of the machine)",
-    )
-    parser.add_argument(
-        "--log",
-        choices=("text", "json"),
-        default="text",
-        help="form of the ready line and of the log on standard error (default: text)",
-    )
+    add("--directory", metavar="DIR", type=_directory, help=text)
+    text = "form of the ready line and of the log on standard error (default: text)"
+    add("--log", choices=("text", "json"), default="text", help=text)
     return parser
 
 
@@ -101,16 +77,11 @@ def main(arguments: Sequence[str] | None = None, program: str = "ros1_master_gua
     given = _parser(program).parse_args(arguments)
     events = EventLog(sys.stderr, as_json=given.log == "json")
     try:
-        settings = GuardSettings(
-            MasterAddress.of(os.environ, given.port),
-            given.python,
-            given.directory,
-            given.silent_s,
-            given.rosout,
-        )
-        number = asyncio.run(_guard(settings, events, as_json=given.log == "json"))
+        address = MasterAddress.of(os.environ, given.port)
+        options = given.python, given.directory, given.silent_s, given.rosout
+        number = asyncio.run(_guard(GuardSettings(address, *options), events))
     except GuardError as error:
-        if given.log == "json":
+        if events.as_json:
             events.event("error", reason=str(error))
         else:
             sys.stderr.write(f"{program}: error: {error}\n")
@@ -120,7 +91,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "ros1_master_gua
     return 0 if number is signal.SIGTERM else 128 + number
 
 
-async def _guard(settings: GuardSettings, events: EventLog, *, as_json: bool) -> signal.Signals:
+async def _guard(settings: GuardSettings, events: EventLog) -> signal.Signals:
     loop = asyncio.get_running_loop()
     ended: asyncio.Future[signal.Signals] = loop.create_future()
 
@@ -132,7 +103,7 @@ async def _guard(settings: GuardSettings, events: EventLog, *, as_json: bool) ->
         uri = settings.address.uri
         told = {"service": uri, "pid": os.getpid(), "master": how}
         text = f"guards the master at {uri}, which was {how}"
-        line = json_line("ready", told) if as_json else text
+        line = json_line("ready", told) if events.as_json else text
         # A closed standard output is no reason not to guard.
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.write(f"{line}\n")

@@ -24,7 +24,7 @@ class EventLog:
 
     def __init__(self, stream: TextIO, *, as_json: bool) -> None:
         self._stream = stream
-        self._as_json = as_json
+        self.as_json = as_json
         self._lines: queue.Queue[str | None] = queue.Queue(_MAX_QUEUED_LINES)
         self._thread = threading.Thread(target=self._work, name="log", daemon=True)
         self._thread.start()
@@ -32,7 +32,7 @@ class EventLog:
     def event(self, name: str, /, **fields: object) -> None:
         """Write an event: a name, and fields in plain data or with a text of their own."""
         with contextlib.suppress(queue.Full):
-            self._lines.put_nowait((json_line if self._as_json else _text)(name, fields))
+            self._lines.put_nowait((json_line if self.as_json else _text)(name, fields))
 
     def close(self) -> None:
         """Write what can be written in half a second."""
@@ -54,12 +54,11 @@ def json_line(name: str, fields: Mapping[str, object]) -> str:
 
 
 def _text(name: str, fields: Mapping[str, object]) -> str:
-    told = {key: value for key, value in fields.items() if value is not None}
-    reason = str(told.pop("reason", ""))
-    parts = [reason] * bool(reason)
-    for key, value in told.items():
-        shown = f"{value:.1f}" if isinstance(value, float) else value
-        parts.append(f"{key.replace('_', ' ')} {shown}")
+    parts = []
+    for key, value in fields.items():
+        shown = f"{value:.1f}" if isinstance(value, float) else str(value)
+        if value is not None:
+            parts.append(shown if key == "reason" else f"{key.replace('_', ' ')} {shown}")
     now = dt.datetime.now().astimezone().isoformat(timespec="milliseconds")
     line = f"{now} {name.replace('_', ' ')}: {', '.join(parts)}"[:_MAX_LINE]
     return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in line)

@@ -1,9 +1,5 @@
 """A guard for the ROS 1 master: when the master dies, a prepared one takes its place at once.
 
-The ROS 1 master is one process that knows where everything is. Without it no service or topic is
-found; existing connections between nodes continue. A restarted stock master knows nothing, and
-nodes do not register again.
-
 The guard owns the listening socket, and each master inherits it. So calls to a master that has just
 died are not refused: they wait in the kernel for the next one, which is already running and has
 loaded all code. It is given what its predecessor had told the guard
@@ -37,22 +33,15 @@ from ros1_master_guard.saved_state import read_journal, write_journal
 from ros1_master_guard.settings import GuardSettings, directory_for, guard_lock, listens_at
 from ros1_master_guard.standby import MasterLink, MasterProcess
 
-_PROBE_EVERY_S = 0.2
-_PROBE_S = 1.0
+_PROBE_EVERY_S, _PROBE_S = 0.2, 1.0
 _POLL_EVERY_S = 0.25
-_POLL_SHARE = 0.1
-"""Largest share of the time for what is done again and again."""
-
-_SPARE_DELAY_S = 0.5
-"""The next master is loaded this long after a start, when the nodes have been served."""
-
+_POLL_SHARE = 0.1  # largest share of the time for what is done again and again
+_SPARE_DELAY_S = 0.5  # the next master is loaded when the nodes have been served
 _RESTART_S = 0.5
 """Pause before another start: after one that failed, or two masters that ended within _STEADY_S."""
 
 _STEADY_S = 1.0
-_LAST_WORDS_S = 1.0
-"""For reading what a master told before it ended."""
-
+_LAST_WORDS_S = 1.0  # for reading what a master told before it ended
 _BACKLOG = 1024
 
 
@@ -69,25 +58,18 @@ class MasterGuard:
         )
         self._listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self._spare: MasterProcess | None = None
-        self._own: MasterProcess | None = None
-        """The master, if this guard has started it."""
-        self._pid: int | None = None
-        """The master's process; None while there is none, or it has never answered."""
-        self._link: MasterLink | None = None
-        """Where the master tells what changes; None for a stock master."""
-        self._known = MasterState()
-        """What the master knows."""
-        self._saved: tuple[MasterState, int] | None = None
-        self._unsaved = ""
-        """Why the journal is not up to date."""
+        self._own: MasterProcess | None = None  # the master, if this guard has started it
+        self._pid: int | None = None  # None while there is no master, or it has never answered
+        self._link: MasterLink | None = None  # where a guarded master tells what changes
+        self._known = MasterState()  # what the master knows
+        self._saved: tuple[MasterState | None, int] = None, 0  # what the journal has
+        self._is_failing = False  # whether the journal cannot be written
         self._rosout = Rosout(settings.address.uri, self._uri, events)
 
     async def run(self, ready: Callable[[str], None]) -> None:
         """Guard until cancelled, then end a master that was started here.
 
         ``ready`` is called once when a master answers, with ``started``, ``resumed`` or ``found``.
-
-        Raises GuardError if nothing can be guarded.
         """
         directory = directory_for(self._settings.directory)
         self._journal = directory / f"master-{self._port}.journal"
@@ -127,7 +109,7 @@ class MasterGuard:
         except GoneError:
             pass
         except SilentError as error:
-            self._events.event("note", reason=str(error))
+            self._events.event("note", reason=error)
             self._known = self._read_journal()
             return "found"
         except CallError as error:
@@ -208,13 +190,11 @@ class MasterGuard:
 
     def _signal(self, number: signal.Signals) -> bool:
         """Signal the master, if it is a process of this user on this machine."""
-        if self._pid is None or not listens_at(self._pid, self._port):
-            return False
-        try:
-            os.kill(self._pid, number)
-        except OSError:
-            return False
-        return True
+        with contextlib.suppress(OSError):
+            if self._pid is not None and listens_at(self._pid, self._port):
+                os.kill(self._pid, number)
+                return True
+        return False
 
     # -- what the master knows ---------------------------------------------------------------------
 
@@ -228,14 +208,11 @@ class MasterGuard:
         except OSError as error:
             raise CallError(f"{self._uri}: {error}") from error
         self._known = await snapshot(connection) if self._link is None else self._link.state
-        is_new, self._pid = self._pid != pid, pid
-        if is_new:
-            self._events.event(
-                "guarding",
-                service=self._settings.address.uri,
-                pid=pid,
-                started_by="somebody else" if self._link is None else "an earlier guard",
-            )
+        if self._pid != pid:
+            self._pid = pid
+            by = "somebody else" if self._link is None else "an earlier guard"
+            uri = self._settings.address.uri
+            self._events.event("guarding", service=uri, pid=pid, started_by=by)
 
     async def _follow(self) -> None:
         """Keep up with what the master knows, until cancelled."""
@@ -260,23 +237,20 @@ class MasterGuard:
             await _pause(monotonic() - began)
 
     def _save(self) -> None:
-        now = self._known, self._known.changes
-        is_saved = self._saved is not None and self._saved[0] is now[0] and self._saved[1] == now[1]
-        if is_saved and self._journal.exists():
+        known, changes = now = self._known, self._known.changes
+        if self._saved[0] is known and self._saved[1] == changes and self._journal.exists():
             return
-        before = self._unsaved
         try:
-            write_journal(self._journal, self._known)
+            write_journal(self._journal, known)
         except Exception as error:  # noqa: BLE001 - a parameter may have any type
-            self._unsaved = (
-                f"{self._journal}: what the master knows cannot be written down: {_words_of(error)}"
-            )
-            if not before:
-                self._events.event("journal_failed", reason=self._unsaved)
+            if not self._is_failing:
+                reason = f"what the master knows cannot be written down: {_words_of(error)}"
+                self._events.event("journal_failed", reason=f"{self._journal}: {reason}")
+            self._is_failing = True
         else:
-            self._saved, self._unsaved = now, ""
-            if before:
+            if self._is_failing:
                 self._events.event("journal_written", reason=f"{self._journal}: is whole again")
+            self._saved, self._is_failing = now, False
 
     def _read_journal(self) -> MasterState:
         """Return what a master knew that ended with its guard."""
@@ -297,10 +271,10 @@ class MasterGuard:
                 await self._start(self._known, gone, silent, noticed_at)
             except _TakenError as error:
                 # Another program was faster, such as a unit that restarts roscore.
-                self._events.event("note", reason=str(error))
+                self._events.event("note", reason=error)
                 return
             except (GuardError, OSError) as error:
-                self._events.event("master_failed", reason=str(error))
+                self._events.event("master_failed", reason=error)
                 await self._drop_spare()
                 await asyncio.sleep(_RESTART_S)
             else:
@@ -309,7 +283,7 @@ class MasterGuard:
     async def _start(
         self, known: MasterState, gone: set[str], silent: set[str], noticed_at: float | None = None
     ) -> None:
-        begun_at = monotonic() if noticed_at is None else noticed_at
+        begun_at = noticed_at or monotonic()
         self._bind()
         state = without(known, gone)
         master = self._next_master()

@@ -6,7 +6,6 @@ and the MD5 digest of its type. A header, like any message of TCPROS, comes afte
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping
 from urllib.parse import urlsplit
 
@@ -15,24 +14,18 @@ from ros1_master_guard.errors import ProtocolError
 MAX_HEADER_BYTES = 64 * 1024
 """Bound on a connection header; a topic's contains the whole definition of its type."""
 
-ANY_TYPE = "*"
-"""The digest that matches any type."""
-
-_LENGTH = struct.Struct("<I")
+ANY_TYPE = "*"  # the digest that matches any type
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
     """Encode a connection header."""
-    parts = []
-    for name, value in fields.items():
-        field = f"{name}={value}".encode()
-        parts += [_LENGTH.pack(len(field)), field]
-    return encode_message(b"".join(parts))
+    written = (f"{name}={value}".encode() for name, value in fields.items())
+    return encode_message(b"".join(map(encode_message, written)))
 
 
 def encode_message(payload: bytes) -> bytes:
     """Encode a request, or a message of a topic."""
-    return _LENGTH.pack(len(payload)) + payload
+    return len(payload).to_bytes(4, "little") + payload
 
 
 def decode_header(data: bytes) -> dict[str, str]:
@@ -42,11 +35,11 @@ def decode_header(data: bytes) -> dict[str, str]:
     while place < len(data):
         size = int.from_bytes(data[place : place + 4], "little")
         field = data[place + 4 : place + 4 + size]
+        place += 4 + size
         name, equals, value = field.decode(errors="replace").partition("=")
         if len(field) != size or not equals:
             raise ProtocolError("has sent no connection header of ROS 1")
         fields[name] = value
-        place += 4 + size
     return fields
 
 

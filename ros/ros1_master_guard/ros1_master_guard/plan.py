@@ -1,7 +1,7 @@
 """What a new master begins with: the last one's state, without the nodes that have ended.
 
-A master knows what nodes have registered, and nodes may die unnoticed while there is none. So every
-node is asked before a new master begins. Silent ones are kept: they may be stopped, or far away.
+Nodes may die unnoticed while there is no master. So every node is asked before a new one begins.
+Silent ones are kept: they may be stopped, or far away.
 """
 
 from __future__ import annotations
@@ -14,11 +14,8 @@ from ros1_master_guard.errors import CallError, GoneError, SilentError
 from ros1_master_guard.process import MasterState
 from ros1_master_guard.ros1_calls import CALLER, Connection, call
 
-_ANSWER_S = 0.3
-"""Longest wait for a node while there is no master."""
-
-_ANSWERS_S = 1.0
-"""Longest wait for all of them together."""
+_ANSWER_S, _ANSWERS_S = 0.3, 1.0
+"""Longest wait for a node while there is no master, and for all of them together."""
 
 _BROKEN_AGAIN_S = (0.02, 0.1, 0.2)
 """Pauses after a broken connection: the node may be about to end."""
@@ -84,20 +81,16 @@ async def snapshot(connection: Connection) -> MasterState:
     Nodes and services that ended between two questions are left out. No call returns the
     subscribers of parameters.
     """
-    asked = [
-        ("getSystemState", (CALLER,)),
-        ("getTopicTypes", (CALLER,)),
-        ("getParam", (CALLER, "/")),
-    ]
+    asked: list[tuple[str, tuple[str, ...]]]
+    asked = [(method, (CALLER,)) for method in ("getSystemState", "getTopicTypes")]
+    asked.append(("getParam", (CALLER, "/")))
     tables, types, parameters = await connection.calls(asked, within_s=_SNAPSHOT_S)
     try:
         state = MasterState(parameters=dict(parameters), types=dict(types))
         publishers, subscribers, services = tables
         names = sorted({node for table in tables for _, nodes in table for node in nodes})
-        asked = [
-            *(("lookupNode", (CALLER, node)) for node in names),
-            *(("lookupService", (CALLER, service)) for service, _ in services),
-        ]
+        asked = [("lookupNode", (CALLER, node)) for node in names]
+        asked += [("lookupService", (CALLER, service)) for service, _ in services]
         found = await connection.calls(asked, within_s=_SNAPSHOT_S)
         uris = dict(zip(names, found, strict=False))
         for kept, table in ((state.publishers, publishers), (state.subscribers, subscribers)):

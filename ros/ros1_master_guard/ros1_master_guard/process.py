@@ -1,9 +1,8 @@
 """A ROS 1 master that tells its guard of every change before it confirms it.
 
-A stock master keeps publishers, subscribers, services and parameters in memory, and loses them when
-it is killed. This one is the stock master (``rosmaster``, same code, same answers), but each change
-is in the socket of its guard before the node gets its answer. So the guard knows all that a master
-had confirmed, even the subscribers of parameters, which no call returns.
+It is the stock master (``rosmaster``, same code, same answers), but each change is in the socket of
+its guard before the node gets its answer. So the guard knows all that a master had confirmed, even
+the subscribers of parameters, which no call returns.
 
 ROS's Python runs this file. It may be older than the guard's, so the file imports only the standard
 library and, once it runs, ``rosmaster``. The guard imports :class:`MasterState` and the messages'
@@ -33,9 +32,7 @@ from typing import Any, Dict, List, NoReturn, Tuple  # noqa: UP035 (older Python
 Registrations = Dict[str, List[Tuple[str, str]]]  # noqa: UP006
 """Nodes of each topic or parameter: name and URI of the node's XML-RPC server."""
 
-HEAD = struct.Struct("<Q")
-"""The size in bytes that precedes each message."""
-
+HEAD = struct.Struct("<Q")  # the size in bytes that precedes each message
 _SEND_S, _SEND_STATE_S = 1.0, 10.0
 """A guard that takes longer to read a change, or the state, is told no more; it asks again."""
 
@@ -46,18 +43,14 @@ masters have three."""
 
 @dataclass
 class MasterState:
-    """A master's state.
-
-    ``parameters`` is a tree, in which a namespace is a dict. Registrations are by topic, or by
-    parameter. ``services`` has the node's name, the URI of its XML-RPC server, and the service's
-    own URI; ``types`` has the type of each topic's messages. ``changes`` counts those applied.
-    """
+    """A master's state: registrations by topic or parameter, and a tree of parameters."""
 
     parameters: dict[str, Any] = field(default_factory=dict)
     publishers: Registrations = field(default_factory=dict)
     subscribers: Registrations = field(default_factory=dict)
+    # Of each service the node's name, the URI of the node's XML-RPC server, and the service's own.
     services: dict[str, tuple[str, str, str]] = field(default_factory=dict)
-    types: dict[str, str] = field(default_factory=dict)
+    types: dict[str, str] = field(default_factory=dict)  # of topics
     parameter_subscribers: Registrations = field(default_factory=dict)
     changes: int = field(default=0, compare=False)
 
@@ -74,10 +67,10 @@ class MasterState:
             getattr(self, table)[key] = value
 
     def _set_parameter(self, key: str, value: Any) -> None:
-        *spaces, last = [part for part in key.split("/") if part] or [""]
-        if not last:
+        if not (parts := [part for part in key.split("/") if part]):
             self.parameters = value
             return
+        *spaces, last = parts
         tree = self.parameters
         for space in spaces:
             inner = tree.get(space)
@@ -103,15 +96,14 @@ class MasterState:
 # -- messages --------------------------------------------------------------------------------------
 
 
+_CLASSES = "xmlrpc.client.Binary", "xmlrpc.client.DateTime", "datetime.datetime"
+
+
 class _PlainData(pickle.Unpickler):
     """Reads what parameters can be, and no code."""
 
     def find_class(self, module: str, name: str) -> Any:
-        if (module, name) in {
-            ("xmlrpc.client", "Binary"),
-            ("xmlrpc.client", "DateTime"),
-            ("datetime", "datetime"),
-        }:
+        if f"{module}.{name}" in _CLASSES:
             return super().find_class(module, name)
         raise pickle.UnpicklingError(f"{module}.{name} is no parameter")
 
@@ -362,9 +354,6 @@ def main() -> NoReturn:
             state = MasterState(**decoded(told.read(size)))
     except (OSError, EOFError, struct.error, pickle.UnpicklingError):
         sys.exit(0)  # the guard is no more
-    # What a stock master prints, it prints for nobody here.
-    with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
-        os.dup2(nowhere.fileno(), 1)
     _serve(listening, make(state), guard)
     # Threads of calls that hang must not keep it.
     os._exit(0)

@@ -1,9 +1,8 @@
 """XML-RPC calls to ROS 1 masters and nodes, with deadlines.
 
 The standard library's XML-RPC client has no deadline of its own and makes one call at a time. Here
-a call is a coroutine, so a hundred nodes are called at once, and a timeout differs from a refused
-connection: a node whose port refuses connections is dead, a silent one may be stopped, far away or
-slow.
+a call is a coroutine, and a timeout differs from a refused connection: a node whose port refuses
+connections is dead, a silent one may be stopped, far away or slow.
 """
 
 from __future__ import annotations
@@ -17,14 +16,9 @@ from typing import Any, Final, NamedTuple, Self
 from urllib.parse import urlsplit
 
 from ros1_master_guard.errors import CallError, GoneError, ProtocolError, SilentError
-from ros1_master_guard.headers import (
-    MAX_HEADER_BYTES,
-    host_and_port_of,
-)
+from ros1_master_guard.headers import MAX_HEADER_BYTES, host_and_port_of
 
-CALLER: Final = "/ros1_master_guard"
-"""Name of the caller where no node calls."""
-
+CALLER: Final = "/ros1_master_guard"  # where no node calls
 _MAX_RESPONSE_BYTES: Final = 256 * 1024 * 1024
 
 MAX_SHORT_BYTES: Final = 16 * 1024
@@ -33,15 +27,11 @@ its bytes: texts that are copied, mappings whose names have one hash."""
 
 
 class HttpHead(NamedTuple):
-    """The head of an HTTP message.
-
-    It is the first line, the content's size in bytes (-1: not given), and whether the connection
-    ends after the message.
-    """
+    """The head of an HTTP message."""
 
     line: str
-    size: int
-    ends: bool
+    size: int  # of the content in bytes; -1: not given
+    ends: bool  # whether the connection ends after the message
 
     @classmethod
     async def read(cls, reader: asyncio.StreamReader) -> Self:
@@ -58,8 +48,7 @@ class HttpHead(NamedTuple):
 async def message(reader: asyncio.StreamReader, max_bytes: int, begun: bytes = b"") -> bytes:
     """Read a message of TCPROS after its length; ``begun`` are bytes of the length read before.
 
-    Raises ProtocolError if it is larger than allowed; the message continues a sentence about the
-    sender. Raises EOFError, OSError if none arrives.
+    Raises ProtocolError if it is larger than allowed, and EOFError or OSError if none arrives.
     """
     size = int.from_bytes(begun + await reader.readexactly(4 - len(begun)), "little")
     if size > max_bytes:
@@ -112,8 +101,8 @@ class Connection:
     async def call(self, method: str, *arguments: object, within_s: float) -> Any:
         """Call a method with the caller's name and these arguments; return its value.
 
-        Raises GoneError if nobody listens there. Raises SilentError if no response came in time.
-        Raises CallError if the response reports an error or is malformed.
+        Raises GoneError if nobody listens there, SilentError if no response came in time, and
+        CallError if the response reports an error or is malformed.
         """
         return _value_of(await self._request(method, (self._caller, *arguments), within_s), method)
 
@@ -122,20 +111,18 @@ class Connection:
     ) -> list[Any]:
         """Make several calls in one request; the value of a refused one is None.
 
-        Each call is a method and all its arguments, the caller's name included. Raises as
-        :meth:`call` does.
+        Each is a method and all its arguments, the caller's name included.
         """
         batch = [{"methodName": method, "params": list(arguments)} for method, arguments in calls]
         responses = await self._request("system.multicall", (batch,), within_s)
         if not isinstance(responses, list) or len(responses) != len(batch):
             raise CallError(f"{self.uri}: system.multicall: the answer has another form")
-        values = []
-        for made, response in zip(batch, responses, strict=True):
-            value = None
+        values: list[Any] = []
+        for response in responses:
+            values.append(None)
             # The response to a failed call is a dict.
             with contextlib.suppress(CallError, LookupError, TypeError):
-                value = _value_of(response[0], str(made["methodName"]))
-            values.append(value)
+                values[-1] = _value_of(response[0], "system.multicall")
         return values
 
     async def _request(self, method: str, arguments: tuple[Any, ...], within_s: float) -> Any:
@@ -160,24 +147,18 @@ class Connection:
             self._streams = await connect(self.uri)
         reader, writer = self._streams
         place = urlsplit(self.uri)
-        head_lines = (
-            f"POST {place.path or '/'} HTTP/1.1",
-            f"Host: {place.netloc}",
-            "Content-Type: text/xml",
-            f"Content-Length: {len(body)}",
-        )
-        writer.write("\r\n".join([*head_lines, "\r\n"]).encode() + body)
+        head_lines = f"POST {place.path or '/'} HTTP/1.1", f"Host: {place.netloc}"
+        more_lines = "Content-Type: text/xml", f"Content-Length: {len(body)}"
+        writer.write("\r\n".join([*head_lines, *more_lines, "\r\n"]).encode() + body)
         head = await HttpHead.read(reader)
         if head.line.split(" ")[1:2] != ["200"]:
             raise ValueError(f"it answers {head.line:.100}")
-        if not 0 <= head.size <= self._max_answer_bytes:
-            most = self._max_answer_bytes
+        if not 0 <= head.size <= (most := self._max_answer_bytes):
             raise ValueError(f"its answer has {head.size} bytes; allowed are {most}")
         content = await reader.readexactly(head.size)
         if head.ends:
             self.close()
-        values, _ = decoded(content)
-        return values[0]
+        return decoded(content)[0][0]
 
     def close(self) -> None:
         """Close the connection; the next call opens another."""

@@ -22,10 +22,7 @@ _END_S = 2.0
 
 
 class Rosout:
-    """Keeps one ``/rosout`` running.
-
-    Nodes reach the master at ``master_uri``, this process at ``own_uri``.
-    """
+    """Keeps one ``/rosout`` running; ``own_uri`` is where this process reaches the master."""
 
     def __init__(self, master_uri: str, own_uri: str, events: EventLog) -> None:
         self._master_uri = master_uri
@@ -51,8 +48,7 @@ class Rosout:
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,
-                    # Ctrl-C is for the guard alone.
-                    start_new_session=True,
+                    start_new_session=True,  # Ctrl-C is for the guard alone
                     env={**os.environ, "ROS_MASTER_URI": self._master_uri, "ROS_NAMESPACE": "/"},
                 )
             await asyncio.sleep(_CHECK_EVERY_S)
@@ -63,12 +59,12 @@ class Rosout:
 
     async def end(self) -> None:
         """End the process that was started here, by SIGKILL if need be."""
-        process = self._process
+        if (process := self._process) is None:
+            return
         for number in (signal.SIGINT, signal.SIGKILL):
             until = monotonic() + _END_S
-            if process is not None:
-                process.send_signal(number)
-            while process is not None and process.poll() is None and monotonic() < until:
+            process.send_signal(number)
+            while process.poll() is None and monotonic() < until:
                 await asyncio.sleep(0.01)
 
     async def _exists(self) -> bool:

@@ -15,10 +15,7 @@ _MAGIC = b"ros1_master_guard 2\n"
 
 
 def read_journal(path: Path) -> MasterState | None:
-    """Return what a journal holds; None if there is none.
-
-    Raises OSError if it cannot be read, and ValueError if what is there is no journal.
-    """
+    """Return what a journal holds, or None without one; raise ValueError if it is none."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -33,10 +30,7 @@ def read_journal(path: Path) -> MasterState | None:
 
 
 def write_journal(path: Path, state: MasterState) -> None:
-    """Write a journal in one piece; its directory is made if it is gone.
-
-    If it cannot be written (OSError), the one before is still there.
-    """
+    """Write a journal in one piece, or keep the one before; its directory is made if it is gone."""
     path.parent.mkdir(mode=0o700, exist_ok=True)
     new = path.with_name(f"{path.name}.new")
     new.unlink(missing_ok=True)

@@ -37,10 +37,9 @@ class MasterAddress(NamedTuple):
 
     @classmethod
     def of(cls, environment: Mapping[str, str], port: int | None = None) -> Self:
-        """Read ``ROS_MASTER_URI``, ``ROS_HOSTNAME``, ``ROS_IP`` and ``ROS_IPV6``.
+        """Read ROS's variables; ``port`` replaces the URI's.
 
-        ``port`` replaces that of the URI. Raises GuardError if the URI is none, or names another
-        machine.
+        Raises GuardError if the URI is none, or names another machine.
         """
         text = environment.get("ROS_MASTER_URI") or f"http://localhost:{DEFAULT_PORT}"
         try:
@@ -50,21 +49,18 @@ class MasterAddress(NamedTuple):
             scheme, host, named = "", None, None
         if scheme != "http" or not host:
             raise GuardError(f"ROS_MASTER_URI is {text!r:.200}; expected http://HOST:PORT")
-        # As rosgraph.network has it.
-        own = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP") or ""
-        version_6 = environment.get("ROS_IPV6") == "on"
-        if own == "localhost" or own.startswith("127.") or own == "::1":
-            loopback = own if own.startswith("127.") else "127.0.0.1"
-            bind = "::1" if version_6 else loopback
-        else:
-            bind = "::" if version_6 else "0.0.0.0"
-        address = cls(host, port or named or DEFAULT_PORT, bind)
         if not _is_here(host):
             raise GuardError(
                 f"ROS_MASTER_URI is {text!r:.200}: {host} is no address of this machine; a guard "
                 "runs where its master runs"
             )
-        return address
+        # As rosgraph.network has it.
+        own = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP") or ""
+        bind = "::" if (version_6 := environment.get("ROS_IPV6") == "on") else "0.0.0.0"
+        if own in ("localhost", "::1") or own.startswith("127."):
+            loopback = own if own.startswith("127.") else "127.0.0.1"
+            bind = "::1" if version_6 else loopback
+        return cls(host, port or named or DEFAULT_PORT, bind)
 
 
 def _is_here(host: str) -> bool:
@@ -91,10 +87,7 @@ class GuardSettings(NamedTuple):
 
 
 def directory_for(named: Path | None) -> Path:
-    """Return a directory that can be written to: the named one, or one of this user alone.
-
-    The latter does not outlive the machine's uptime. Raises GuardError if there is none.
-    """
+    """Return a directory that can be written to: the named one, or one of this user alone."""
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     name = "ros1_master_guard"
     own = Path(runtime) / name if runtime else Path(f"/tmp/{name}-{os.getuid()}")
@@ -116,10 +109,7 @@ def directory_for(named: Path | None) -> Path:
 
 @contextlib.contextmanager
 def guard_lock(port: int) -> Iterator[None]:
-    """Keep other guards of a master away, by a name in the kernel that ends with the process.
-
-    Raises GuardError if there is one already.
-    """
+    """Keep other guards of a master away, by a name in the kernel that ends with the process."""
     name = f"\0ros1_master_guard/{port}"
     with socket.socket(socket.AF_UNIX) as lock:
         try:
@@ -131,9 +121,8 @@ def guard_lock(port: int) -> Iterator[None]:
                 asking.connect(name)
                 who = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 4)
                 pid = str(int.from_bytes(who, sys.byteorder))
-            raise GuardError(
-                f"the master at port {port} has a guard already: process {pid}"
-            ) from None
+            reason = f"the master at port {port} has a guard already: process {pid}"
+            raise GuardError(reason) from None
         yield
 
 
@@ -149,12 +138,9 @@ def listens_at(pid: int, port: int) -> bool:
                 fields = line.split()
                 if fields[3] == "0A" and int(fields[1].rpartition(":")[2], 16) == port:
                     sockets.add(f"socket:[{fields[9]}]")
-    try:
-        descriptors = list(Path(f"/proc/{pid}/fd").iterdir())
-    except OSError:
-        return False
-    for descriptor in descriptors:
-        with contextlib.suppress(OSError):
-            if str(descriptor.readlink()) in sockets:
-                return True
+    with contextlib.suppress(OSError):
+        for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+            with contextlib.suppress(OSError):  # it was just closed
+                if str(descriptor.readlink()) in sockets:
+                    return True
     return False

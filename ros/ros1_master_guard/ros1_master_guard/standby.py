@@ -17,27 +17,20 @@ from ros1_master_guard.errors import GuardError
 from ros1_master_guard.process import HEAD, MasterState, decoded, encoded
 from ros1_master_guard.settings import GuardSettings
 
-_START_S = 30.0
-_END_S = 2.0
+_START_S, _END_S = 30.0, 2.0
 _READ_BYTES = 1 << 20
 
 
 class MasterLink:
-    """A connection to a master of :mod:`ros1_master_guard.process`.
+    """A connection to a master, which tells what changes in its ``state``.
 
-    Attributes
-    ----------
-    state : MasterState
-        What the master has told so far.
-    following : asyncio.Task or None
-        Ends with the connection, when all that was told is in the state.
+    ``following`` ends with the connection, when all that was told is in the state.
     """
 
-    def __init__(self, stream: socket.socket) -> None:
-        stream.setblocking(False)
-        self._stream = stream
-        self._loop = asyncio.get_running_loop()
-        self._received = bytearray()
+    def __init__(self, socket_: socket.socket) -> None:
+        socket_.setblocking(False)
+        self._socket = socket_
+        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
         self.state = MasterState()
         self.following: asyncio.Task[None] | None = None
 
@@ -66,6 +59,12 @@ class MasterLink:
         while change := await self._next():
             self.state.apply(*change)
 
+    async def _opened(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        if self._streams is None:
+            opening = asyncio.open_unix_connection(sock=self._socket, limit=_READ_BYTES)
+            self._streams = await opening
+        return self._streams
+
     async def hear(self) -> Any:
         """Return the next message; a text of its own if none comes."""
         try:
@@ -76,41 +75,32 @@ class MasterLink:
 
     async def say(self, message: Any) -> None:
         """Send a message."""
+        _, writer = await self._opened()
         with contextlib.suppress(OSError):
-            await self._loop.sock_sendall(self._stream, encoded(message))
+            writer.write(encoded(message))
+            await writer.drain()
 
     def close(self) -> None:
         """End the connection."""
         if self.following is not None:
             self.following.cancel()
-        self._stream.close()
+        (self._socket if self._streams is None else self._streams[1]).close()
 
     async def _next(self) -> Any:
         """Return the next message; None at the end."""
-        received = self._received
-        while True:
-            end = HEAD.size + HEAD.unpack_from(received)[0] if len(received) >= HEAD.size else None
-            if end is not None and len(received) >= end:
-                message = decoded(bytes(received[HEAD.size : end]))
-                del received[:end]
-                return message
-            try:
-                data = await self._loop.sock_recv(self._stream, _READ_BYTES)
-            except OSError:
-                data = b""
-            if not data:
-                return None
-            received += data
+        reader, _ = await self._opened()
+        try:
+            (size,) = HEAD.unpack(await reader.readexactly(HEAD.size))
+            return decoded(await reader.readexactly(size))
+        except (OSError, EOFError):
+            return None
 
 
 class MasterProcess:
     """A process that is a master, or waits to become one; it survives this one.
 
-    It inherits ``listening``, which need not be bound yet. The standard library's subprocess
-    coroutines would end it with the loop. ``ended`` is its exit code, or the negative number of the
-    signal that ended it.
-
-    Raises GuardError if it cannot be started.
+    It inherits ``listening``, which need not be bound yet. ``ended`` is its exit code, or the
+    negative number of the signal that ended it. Raises GuardError if it cannot be started.
     """
 
     def __init__(self, settings: GuardSettings, listening: socket.socket) -> None:
@@ -133,13 +123,13 @@ class MasterProcess:
             )
         except OSError as error:
             mine.close()
-            raise GuardError(
-                f"--python {settings.python}: cannot be run: {error.strerror}"
-            ) from error
+            reason = f"--python {settings.python}: cannot be run: {error.strerror}"
+            raise GuardError(reason) from error
         finally:
             its.close()
         self.link = MasterLink(mine)
         self.pid = self._process.pid
+        # The standard library's subprocess coroutines would end it with the loop.
         threading.Thread(target=self._wait, daemon=True).start()
 
     def _wait(self) -> None:

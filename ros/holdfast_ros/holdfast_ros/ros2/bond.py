@@ -1,8 +1,7 @@
 """The node's end of a bond, by which Nav2's lifecycle manager sees that a node has died.
 
-The manager listens on the topic ``bond``. It takes a node for dead whose heartbeats stop for its
-``bond_timeout``. Each bond has an identifier, the node's name, and each of its ends another one of
-its own. A bond that the node itself ends is said to be ended, and the next one is a new one.
+The manager takes a node for dead whose heartbeats on the topic ``bond`` stop. A bond has the node's
+name as its identifier, and each of its ends another one. After its end the next is a new one.
 """
 
 from __future__ import annotations
@@ -13,8 +12,7 @@ from typing import Any
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 
-_TIMEOUT_S = 4.0
-"""After which an end without heartbeats is dead, as Nav2 has it."""
+_TIMEOUT_S = 4.0  # after which an end without heartbeats is dead, as Nav2 has it
 
 
 class Bond:

@@ -18,14 +18,10 @@ from holdfast_ros.ros2.run_segment import Ending, RunSegment, SegmentResult
 from holdfast_ros.ros2.telemetry import Telemetry
 
 _HOLDING = "holding still"
+_ALARMS = ("lost", "sensor_suspect", "wrong_answer")
 
 
-class Level(enum.IntEnum):
-    """As ROS counts."""
-
-    OK = 0
-    WARN = 1
-    ERROR = 2
+Level = enum.IntEnum("Level", ["OK", "WARN", "ERROR"], start=0)  # as ROS counts
 
 
 class RobotDiagnosis(NamedTuple):
@@ -51,7 +47,7 @@ class Diagnostics:
 
     def event(self, name: str) -> None:
         """Take note of an event of the robot's, from its thread."""
-        if name in ("lost", "sensor_suspect", "wrong_answer"):
+        if name in _ALARMS:
             self._alarms.add(name)
         elif name in ("reinitialised", "trial"):
             # The belief is a new one. A service that has answered wrongly is asked no more.
@@ -69,8 +65,9 @@ class Diagnostics:
     ) -> RobotDiagnosis:
         """Return the diagnosis, by the running segment, the last result and the last telemetry."""
         condition = None if segment is None else segment.condition()
+        level = Level.OK
         if condition is not None:
-            word, level = condition.word, Level.OK
+            word = condition.word
             if word == _HOLDING:
                 level = self._level_of_holding()
             elif word == Status.LOCAL_RECOVERY.value or self._alarms:
@@ -79,14 +76,11 @@ class Diagnostics:
             word = last.ending.name.lower()
             level = Level.ERROR if last.ending in (Ending.HELD, Ending.FAILED) else Level.OK
         else:
-            word, level = "starting" if segment is not None else "idle", Level.OK
-        if segment is not None:
+            word = "idle" if segment is None else "starting"
+        if (part := segment or last) is not None:
             # Until the next segment has a status, the last known one is shown.
-            self._status = segment.status or self._status
-            self._finished = segment.num_finished
-        elif last is not None:
-            self._status = last.status or self._status
-            self._finished = last.num_finished
+            self._status = part.status or self._status
+            self._finished = part.num_finished
         trial = None if condition is None else condition.trial
         facts = {
             "status": self._status,
@@ -96,9 +90,7 @@ class Diagnostics:
             "trial": "" if trial is None else trial,
             "finished_trials": self._finished,
             "unexplained_observations": 0 if segment is None else segment.unexplained_observations,
-            "lost": str("lost" in self._alarms).lower(),
-            "sensor_suspect": str("sensor_suspect" in self._alarms).lower(),
-            "wrong_answer": str("wrong_answer" in self._alarms).lower(),
+            **{name: str(name in self._alarms).lower() for name in _ALARMS},
             "decisions_not_published": 0 if telemetry is None else telemetry.dropped_decisions,
             "last_error": "" if last is None or level != Level.ERROR else last.message[:500],
         }

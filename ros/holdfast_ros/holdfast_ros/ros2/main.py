@@ -11,10 +11,8 @@ import signal
 import sys
 import textwrap
 import threading
-from collections.abc import Sequence
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
 
 _USAGE = """\
 usage: ros2 run holdfast_ros node [--ros-args [-p NAME:=VALUE]... [--params-file FILE]]
@@ -46,14 +44,12 @@ def usage() -> str:
     for name, text in OWN.items():
         default = OWN_DEFAULTS[name]
         shown = str(default).lower() if isinstance(default, bool) else default
-        end = f" (default: {shown})" if shown not in ("", []) else ""
-        indent = " " * 24
-        lines.append(f"  {name:<22}" if len(name) <= 21 else f"  {name}\n{indent}")
-        lines[-1] += textwrap.fill(text + end, 76).replace("\n", f"\n{indent}") + "\n"
-    return _USAGE + "".join(lines) + _USAGE_END
+        words = f"{text} (default: {shown})" if shown not in ("", []) else text
+        lines += [f"  {name}", textwrap.indent(textwrap.fill(words, 90), " " * 8)]
+    return _USAGE + "\n".join(lines) + "\n" + _USAGE_END
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: list[str] | None = None) -> int:
     """Run the node, and return the exit code."""
     given = sys.argv[1:] if arguments is None else arguments
     if "--help" in given or "-h" in given:
@@ -67,11 +63,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from holdfast_ros.ros2.node import NUM_THREADS, HoldfastNode
     except ImportError as error:
         missing = (error.name or "").partition(".")[0]
-        what = (
-            "build and source the package holdfast_interfaces (colcon build --base-paths ros)"
-            if missing == "holdfast_interfaces"
-            else "source your ROS 2 (. /opt/ros/DISTRIBUTION/setup.bash)"
-        )
+        what = "source your ROS 2 (. /opt/ros/DISTRIBUTION/setup.bash)"
+        if missing == "holdfast_interfaces":
+            what = f"build and source the package {missing} (colcon build --base-paths ros)"
         sys.stderr.write(f"holdfast: error: there is no {missing or error}: {what}\n")
         return 2
     asked_to_end = threading.Event()
@@ -86,19 +80,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number in saved:
         signal.signal(number, end)
     try:
-        rclpy.init(
-            args=None if arguments is None else list(arguments),
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = HoldfastNode()
     except RuntimeError as error:  # what ROS cannot read on the command line, or in a file
         sys.stderr.write(f"holdfast: error: {error}\n")
         return 2
     if not node.autostart:
-        node.get_logger().info(
-            f"unconfigured; go on with {node.how_to_activate()}; or start it with "
-            "-p autostart:=true"
-        )
+        how = f"go on with {node.how_to_activate()}; or start it with -p autostart:=true"
+        node.get_logger().info(f"unconfigured; {how}")
     elif node.trigger_configure() == node.SUCCESS and node.trigger_activate() == node.SUCCESS:
         node.get_logger().info("active")
     executor = MultiThreadedExecutor(num_threads=NUM_THREADS)

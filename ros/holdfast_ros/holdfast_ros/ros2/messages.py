@@ -52,48 +52,37 @@ def frame_message(parent: str, child: str, turn: Iterable[float], stamp: Time) -
 
 def decision_message(shown: PublishedDecision, problem: Problem, frame_id: str, stamp: Time) -> Any:
     """Return an order as a message."""
-    sensing_action = shown.sensing_action
+    sensing = shown.sensing_action
     return Decision(
         header=Header(frame_id=frame_id, stamp=stamp),
-        trial=shown.trial,
-        step=shown.step,
-        stage=shown.stage,
-        kind=Decision.ACT if sensing_action is None else Decision.SENSE,
-        sensing_action=sensing_action or 0,
-        sensing_action_name=(
-            "" if sensing_action is None else sensing_labels(problem)[sensing_action]
-        ),
+        kind=Decision.ACT if sensing is None else Decision.SENSE,
+        sensing_action=sensing or 0,
+        sensing_action_name="" if sensing is None else sensing_labels(problem)[sensing],
         entropies=floats(shown.entropies),
         task_action=floats(shown.task_action),
-        status=shown.status,
-        decided_by=shown.decided_by,
+        **_copied(shown, "trial", "step", "stage", "status", "decided_by"),
     )
 
 
 def outcome_message(result: TrialResult) -> Any:
     """Return a trial's result as a message."""
     return TrialOutcome(
-        trial=result.trial,
-        outcome=result.outcome,
-        steps=result.steps,
         has_reward=result.reward is not None,
         reward=float(result.reward or 0.0),
-        recoveries=result.recoveries,
+        **_copied(result, "trial", "outcome", "steps", "recoveries", "digest"),
         unexplained_observations=result.unexplained_observations,
-        digest=result.digest,
     )
 
 
+def _copied(source: object, *fields: str) -> dict[str, Any]:
+    return {field: getattr(source, field) for field in fields}
+
+
 def pose_array(poses: FloatArray, frame_id: str, stamp: Time) -> bytes:
-    """Return a serialised ``geometry_msgs/PoseArray``.
+    """Return a serialised ``geometry_msgs/PoseArray`` of positions and quaternions (x, y, z, w).
 
     As objects, three hundred poses take rclpy milliseconds, in which no other thread of Python
     runs. CDR is what all of ROS 2's middlewares send, and of poses it is an array of numbers.
-
-    Parameters
-    ----------
-    poses : array of shape (N, 7)
-        Position and quaternion (x, y, z, w).
     """
     name = frame_id.encode() + b"\0"
     body = struct.pack("<iII", stamp.sec, stamp.nanosec, len(name)) + name

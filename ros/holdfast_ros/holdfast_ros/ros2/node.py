@@ -1,8 +1,7 @@
 """The lifecycle node: parameters in, a run on its own thread, and topics, services and actions.
 
-The node decides nothing. It reads the parameters when it is configured. While it is active, a goal
-of ``~/run`` or a call of ``~/decide`` starts a segment of the run
-(:class:`~holdfast_ros.ros2.run_segment.RunSegment`): the same robot process as in ``holdfast run``.
+It reads the parameters when it is configured. While it is active, a goal of ``~/run`` or a call of
+``~/decide`` starts a segment of the run: the same robot process as in ``holdfast run``.
 Deactivating the node pauses the segment; the next one continues the run.
 
 Threads: rclpy's executor calls the node's methods on several threads. The robot's loop, the
@@ -17,6 +16,7 @@ import platform
 import threading
 import time
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import holdfast_interfaces.action
@@ -58,59 +58,36 @@ from holdfast_ros.ros2.parameters import (
 )
 from holdfast_ros.ros2.run_segment import Ending, RunSegment, SegmentResult, make_world
 from holdfast_ros.ros2.telemetry import PublishedDecision, Telemetry
-from holdfast_ros.ros2_connections import Connections
+from holdfast_ros.ros2_environment import Connections
 
 _Run = holdfast_interfaces.action.Run
 _Decide = holdfast_interfaces.srv.Decide
 
-_MOST_CALLS = 3
-"""Calls of ``~/decide`` that may wait at once."""
+_MOST_CALLS = 3  # of ~/decide may wait at once
+NUM_THREADS = 4 + _MOST_CALLS
+"""A goal and the calls may keep theirs for a while; the rest is always free."""
 
 _DONE: Mapping[int, Any] = {0: False, 1: True, 2: "failed"}
 """Values of a call's ``done``; any other number is refused."""
 
-NUM_THREADS = 4 + _MOST_CALLS
-"""A goal and the calls may keep theirs for a while; the rest is always free."""
-
 _DIAGNOSTICS_S = 1.0
-
-_RESULT_S = 0.5
-"""At the end of the process: for the client that waits for its result to get it."""
-
+_RESULT_S = 0.5  # at the end of the process, for the client of the goal to get its result
 _WARNINGS = {"holding", "lost", "sensor_suspect", "wrong_answer"}
 _LOGGED = _WARNINGS | {"status", "resumed", "reinitialised", "stopped"}
-_TOLD_AT_ONCE = _LOGGED | {
-    *("launch_failed", "recovery_exited", "unexplained", "service_vanished", "service_appeared"),
-    "trial",
-}
+_TOLD_AT_ONCE = _LOGGED | {"trial", "launch_failed", "recovery_exited", "unexplained"}
+_TOLD_AT_ONCE |= {"service_vanished", "service_appeared"}
 """Events that change the diagnostics."""
-
-
-class _Events:
-    """Takes the robot's events, on the robot's loop."""
-
-    def __init__(self, node: HoldfastNode, diagnostics: Diagnostics, telemetry: Telemetry) -> None:
-        self._node = node
-        self._diagnostics = diagnostics
-        self._telemetry = telemetry
-
-    def event(self, name: str, /, **fields: object) -> None:
-        """Take an event."""
-        if name in _TOLD_AT_ONCE:
-            self._diagnostics.event(name)
-            if name in _LOGGED:
-                words = f"{name.replace('_', ' ')}: {in_parameters(fields_as_text(fields))}"
-                self._node.log(words, "warning" if name in _WARNINGS else "info")
-            self._telemetry.notice()
-
-    def close(self) -> None:
-        """Take no more."""
 
 
 class HoldfastNode(LifecycleNode):  # type: ignore[misc]
     """The robot's part of active sensing."""
 
     SUCCESS = TransitionCallbackReturn.SUCCESS
+
+    _parameters_read: NodeParameters | None
+    _last_result: SegmentResult | None
+    _telemetry: Telemetry | None
+    _diagnostics: Diagnostics | None
 
     def __init__(self, name: str = "holdfast") -> None:
         super().__init__(
@@ -123,14 +100,11 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         self._robot = Connections(self)
         # Guards the fields below.
         self._changed = threading.RLock()
-        self._parameters_read: NodeParameters | None = None
         self._layout: PoseLayout | None = None
         self._active = False
         self._segment: RunSegment | None = None
-        self._telemetry: Telemetry | None = None
-        self._diagnostics: Diagnostics | None = None
         self._goal: Any = None
-        self._last_result: SegmentResult | None = None
+        self._forget()
         self._calls = threading.BoundedSemaphore(_MOST_CALLS)
         self._goals_ended = threading.Event()
         self._goals_ended.set()
@@ -149,30 +123,20 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             self._frame_publisher = publish(TFMessage, "/tf_static", latched)
         self._bond = Bond(self)
-        self._group = ReentrantCallbackGroup()
-        self._decide_server = self.create_service(
-            _Decide, "~/decide", self._decide, callback_group=self._group
-        )
+        group = ReentrantCallbackGroup()
+        self.create_service(_Decide, "~/decide", self._decide, callback_group=group)
         self._run_server = ActionServer(
-            self,
-            _Run,
-            "~/run",
-            self._execute,
-            callback_group=self._group,
+            *(self, _Run, "~/run", self._execute),
+            callback_group=group,
             goal_callback=self._judge_goal,
             cancel_callback=self._cancel,
         )
-        self._diagnostics_timer = self.create_timer(
-            _DIAGNOSTICS_S,
-            self._tell_diagnostics,
-            callback_group=MutuallyExclusiveCallbackGroup(),
-            # Simulated time may stand still; the diagnostics are to come all the same.
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )
+        # Simulated time may stand still; the diagnostics are to come all the same.
+        clock, alone = Clock(clock_type=ClockType.STEADY_TIME), MutuallyExclusiveCallbackGroup()
+        self.create_timer(_DIAGNOSTICS_S, self._tell_diagnostics, alone, clock)
         self.add_on_set_parameters_callback(self._judge_parameters)
 
-    def log(self, text: str, level: str) -> None:
-        """Log a line."""
+    def _log(self, text: str, level: str) -> None:
         # A logger of rclpy's lets a place in the code have one level for ever.
         getattr(get_logger(self.get_logger().name), level)(text)
 
@@ -201,10 +165,8 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _values(self) -> Mapping[str, Any]:
         """Return what was given: not what the node itself has shown, and nobody has changed."""
-        values = {
-            name: _plain(parameter.value)
-            for name, parameter in self.get_parameters_by_prefix("").items()
-        }
+        parameters = self.get_parameters_by_prefix("").items()
+        values = {name: _plain(parameter.value) for name, parameter in parameters}
         return {name: value for name, value in values.items() if self._shown.get(name) != value}
 
     def _show_in_force(self, read: NodeParameters, given: Mapping[str, Any]) -> None:
@@ -244,10 +206,9 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         except Exception as error:  # noqa: BLE001 - rclpy would hide it
             self.get_logger().error(f"not configured: {_in_words(error)}")
             return TransitionCallbackReturn.FAILURE
+        self._forget()
         with self._changed:
-            self._parameters_read = read
-            self._layout = layout
-            self._last_result = None
+            self._parameters_read, self._layout = read, layout
             self._diagnostics = Diagnostics(read.configuration.recovery)
         self.get_logger().info(
             f"configured: {read.configuration.problem_name}, "
@@ -264,14 +225,13 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         if read is not None:
             self._bond.form(read.own.bond_heartbeat_period)
             if self._frame_publisher is not None and layout is not None and read.own.map_frame:
-                frames, now = (read.own.map_frame, read.own.frame_id), self.get_clock().now()
-                message = messages.frame_message(*frames, layout.upright, now.to_msg())
+                frames = read.own.map_frame, read.own.frame_id
+                message = messages.frame_message(*frames, layout.upright, self._now())
                 self._frame_publisher.publish(message)
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Hold the run, if there is one, and publish nothing more."""
-        self._bond.break_up()
         self._hold("the node was deactivated")
         return super().on_deactivate(state)
 
@@ -282,7 +242,6 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Hold the run and forget everything."""
-        self._bond.break_up()
         self._hold("the node was shut down")
         super().on_deactivate(state)
         self._forget()
@@ -291,7 +250,6 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Go back to the beginning after a defect."""
         self.get_logger().error("a transition has failed; the node is unconfigured again")
-        self._bond.break_up()
         self._hold("a transition of the node has failed")
         super().on_deactivate(state)
         self._forget()
@@ -299,24 +257,29 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     def _hold(self, why: str) -> None:
         """End what runs, so that it can go on later, and let nothing begin."""
+        self._bond.break_up()
         with self._changed:
             self._active = False
             segment, telemetry = self._segment, self._telemetry
-            read = self._parameters_read
-        if segment is not None and read is not None:
-            segment.pause(why, read.own.pause_timeout_s)
+        if segment is not None:
+            within_s = self._pause(segment, why)
             # It ends itself within the time that it was given; the rest is for a slow disk.
-            if not segment.ended.wait(read.own.pause_timeout_s + 10.0):
+            if not segment.ended.wait(within_s + 10.0):
                 self.get_logger().error("the run has not ended; its journal has everything")
         if telemetry is not None:
             telemetry.close()
 
+    def _pause(self, segment: RunSegment, why: str) -> float:
+        """Pause a segment; return the time that it was given, in seconds."""
+        read = self._parameters_read
+        within_s = 0.0 if read is None else read.own.pause_timeout_s
+        segment.pause(why, within_s)
+        return within_s
+
     def _forget(self) -> None:
         with self._changed:
-            self._parameters_read = None
-            self._last_result = None
-            self._telemetry = None
-            self._diagnostics = None
+            self._parameters_read = self._last_result = None
+            self._telemetry = self._diagnostics = None
 
     def end(self) -> bool:
         """End in order, in any state, when the process is asked to; return whether the run has."""
@@ -330,15 +293,12 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
 
     # -- runs ------------------------------------------------------------------------------------
 
-    def _begin_segment(self) -> RunSegment:
+    def _begin_segment(self, read: NodeParameters) -> RunSegment:
         """Start the next part of the run; the caller holds the lock."""
-        read, diagnostics = self._parameters_read, self._diagnostics
-        assert read is not None
+        diagnostics, world = self._diagnostics, make_world(self._robot, read)
         assert diagnostics is not None
-        configuration = read.configuration
-        world = make_world(self._robot, read)
         telemetry = Telemetry(
-            configuration,
+            read.configuration,
             self._show_order,
             self._show_belief,
             self._tell_diagnostics,
@@ -347,22 +307,30 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             wants_entropies=self._wants_entropies,
         )
 
+        def event(name: str, /, **fields: object) -> None:
+            """Take an event, on the robot's loop."""
+            if name in _TOLD_AT_ONCE:
+                diagnostics.event(name)
+                if name in _LOGGED:
+                    words = f"{name.replace('_', ' ')}: {in_parameters(fields_as_text(fields))}"
+                    self._log(words, "warning" if name in _WARNINGS else "info")
+                telemetry.notice()
+
         def on_order(state: PlanningState, order: Act | Sense) -> None:
             telemetry.order(state, order, segment.status)
 
         segment = RunSegment(
-            configuration=configuration,
+            configuration=read.configuration,
             path=read.run_directory,
             world=world,
             rate_hz=read.own.rate_hz or None,
             after_reboot=read.own.after_reboot,
-            sink=_Events(self, diagnostics, telemetry),
+            sink=SimpleNamespace(event=event, close=lambda: None),
             on_order=on_order,
             on_timing=telemetry.time,
             on_end=self._segment_ended,
         )
-        self._telemetry = telemetry
-        self._segment = segment
+        self._telemetry, self._segment = telemetry, segment
         segment.start()
         return segment
 
@@ -370,14 +338,14 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         with self._changed:
             telemetry, segment = self._telemetry, self._segment
             self._last_result = outcome
-        handover = None if segment is None else segment.world.handover
-        if handover is not None:
+        if segment is not None and segment.world.handover is not None:
             finished = outcome.ending == Ending.FINISHED
-            handover.end(DecideCode.FINISHED if finished else DecideCode.ENDED, outcome.message)
+            code = DecideCode.FINISHED if finished else DecideCode.ENDED
+            segment.world.handover.end(code, outcome.message)
         if telemetry is not None:
             telemetry.close()
         level = "info" if outcome.ending in (Ending.FINISHED, Ending.PAUSED) else "error"
-        self.log(f"{outcome.ending.name.lower()}: {outcome.message}", level)
+        self._log(f"{outcome.ending.name.lower()}: {outcome.message}", level)
         with self._changed:
             self._segment = None
         self._tell_diagnostics()
@@ -386,46 +354,40 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         del request
         if self._active:
             return GoalResponse.ACCEPT
-        state = self._state_machine.current_state[1]
-        self.get_logger().warning(
-            f"a goal of ~/run was rejected: the node is {state}, and takes goals while it is "
-            f"active: {self.how_to_activate()}"
-        )
+        state, how = self._state_machine.current_state[1], self.how_to_activate()
+        reason = f"the node is {state}, and takes goals while it is active: {how}"
+        self.get_logger().warning(f"a goal of ~/run was rejected: {reason}")
         return GoalResponse.REJECT
 
     def _cancel(self, goal: Any) -> CancelResponse:
         with self._changed:
             segment = self._segment if goal == self._goal else None
-            read = self._parameters_read
-        if segment is not None and read is not None:
-            segment.pause("the goal was cancelled", read.own.pause_timeout_s)
+        if segment is not None:
+            self._pause(segment, "the goal was cancelled")
         return CancelResponse.ACCEPT
 
     def _execute(self, goal: Any) -> Any:
         """Run until it is done, or held; on a thread of the executor."""
         read = self._parameters_read
-        refusal = None
+        refused = _Run.Result(code=_Run.Result.REFUSED, message="the node is not active")
         segment = None
         with self._changed:
-            if not self._active or read is None:
-                refusal = "the node is not active"
-            elif self._goal is not None:
-                refusal = "another goal is running; cancel it, or wait for its result"
-            else:
+            if self._goal is not None:
+                refused.message = "another goal is running; cancel it, or wait for its result"
+            elif self._active and read is not None:
                 try:
                     # One that a call of ~/decide has begun is gone on with.
-                    segment = self._segment or self._begin_segment()
+                    segment = self._segment or self._begin_segment(read)
+                    self._goal = goal
+                    self._goals_ended.clear()
                 except Exception as error:  # noqa: BLE001 - rclpy would call it finished
-                    goal.abort()
-                    return _Run.Result(code=_Run.Result.HELD, message=_in_words(error))
-                self._goal = goal
-                self._goals_ended.clear()
+                    refused = _Run.Result(code=_Run.Result.HELD, message=_in_words(error))
         if segment is None or read is None:
             goal.abort()
-            return _Run.Result(code=_Run.Result.REFUSED, message=refusal or "")
+            return refused
         try:
             if goal.is_cancel_requested:
-                segment.pause("the goal was cancelled", read.own.pause_timeout_s)
+                self._pause(segment, "the goal was cancelled")
             segment.ended.wait()
             outcome = segment.outcome
             assert outcome is not None
@@ -454,28 +416,32 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             response.message = f"{_MOST_CALLS} calls are waiting already; make the same call again"
             return response
         try:
-            return self._decide_one(request, response)
+            self._decide_one(request, response)
         except Exception as error:  # noqa: BLE001 - else there is no answer at all
             response.code, response.message = DecideCode.ENDED, _in_words(error)
-            return response
         finally:
             self._calls.release()
+        return response
 
-    def _decide_one(self, request: Any, response: Any) -> Any:
+    def _decide_one(self, request: Any, response: Any) -> None:
         with self._changed:
             read, last = self._parameters_read, self._last_result
-            reason = self._no_calls()
-            segment: RunSegment | None = None
-            if reason is None and (last is None or last.ending != Ending.FINISHED):
-                segment = self._segment or self._begin_segment()
-        if reason is not None:
-            response.code, response.message = DecideCode.INACTIVE, reason
-            return response
-        handover = None if segment is None else segment.world.handover
-        if handover is None or segment is None or read is None:
-            response.code = DecideCode.FINISHED
-            response.message = "" if last is None else last.message
-            return response
+            if not self._active or read is None:
+                response.code = DecideCode.INACTIVE
+                response.message = f"the node is not active: {self.how_to_activate()}"
+                return
+            if (kind := read.own.environment) != "executive":
+                response.code = DecideCode.INACTIVE
+                response.message = (
+                    f"environment.kind is {kind}: the node itself performs what it decides; it "
+                    "must be executive for calls of ~/decide"
+                )
+                return
+            if last is not None and last.ending == Ending.FINISHED:
+                response.code, response.message = DecideCode.FINISHED, last.message
+                return
+            segment = self._segment or self._begin_segment(read)
+        assert segment.world.handover is not None
         call = DecideRequest(
             request.trial,
             request.number,
@@ -483,7 +449,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             request.reward if request.has_reward else None,
             _DONE.get(request.done, request.done),
         )
-        reply = handover.call(call, read.own.decide_timeout_s)
+        reply = segment.world.handover.call(call, read.own.decide_timeout_s)
         response.code, response.message = reply.code, reply.message
         response.status = segment.status
         due = reply.due
@@ -497,19 +463,6 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
                 response.sensing_action = due.sensing_action
                 names = sensing_labels(read.configuration.problem)
                 response.sensing_action_name = names[due.sensing_action]
-        return response
-
-    def _no_calls(self) -> str | None:
-        """Return why no call can be answered; None if it can."""
-        read = self._parameters_read
-        if not self._active or read is None:
-            return f"the node is not active: {self.how_to_activate()}"
-        if read.own.environment != "executive":
-            return (
-                f"environment.kind is {read.own.environment}: the node itself performs what it "
-                "decides; it must be executive for calls of ~/decide"
-            )
-        return None
 
     # -- what others see -------------------------------------------------------------------------
 
@@ -517,9 +470,8 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         read, goal, segment = self._parameters_read, self._goal, self._segment
         if read is None or not self._active:
             return
-        problem = read.configuration.problem
-        now = self.get_clock().now().to_msg()
-        message = messages.decision_message(shown, problem, read.own.frame_id, now)
+        place = read.configuration.problem, read.own.frame_id, self._now()
+        message = messages.decision_message(shown, *place)
         self._decision_publisher.publish(message)
         if goal is not None:
             finished = 0 if segment is None else segment.num_finished
@@ -531,21 +483,23 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
         return heard and read is not None and read.own.publish_entropies
 
     def _tell_failure(self, error: Exception) -> None:
-        self.get_logger().warning(
-            f"not all is published of what the robot decides: {_in_words(error)}"
-        )
+        reason = _in_words(error)
+        self.get_logger().warning(f"not all is published of what the robot decides: {reason}")
+
+    def _now(self) -> Any:
+        return self.get_clock().now().to_msg()
 
     def _show_belief(self, state: PlanningState) -> None:
         read, layout = self._parameters_read, self._layout
         if read is None or not self._active:
             return
-        now = self.get_clock().now().to_msg()
         if self._belief_publisher.get_subscription_count():
             problem = read.configuration.problem
             self._belief_publisher.publish(messages.belief_message(state.belief, problem))
         if layout is not None and self._cloud_publisher.get_subscription_count():
             poses = layout.poses(state.belief.states)
-            self._cloud_publisher.publish(messages.pose_array(poses, read.own.frame_id, now))
+            cloud = messages.pose_array(poses, read.own.frame_id, self._now())
+            self._cloud_publisher.publish(cloud)
 
     def _tell_diagnostics(self) -> None:
         with self._changed:
@@ -563,7 +517,7 @@ class HoldfastNode(LifecycleNode):  # type: ignore[misc]
             values=[KeyValue(key=key, value=value) for key, value in facts.items()],
         )
         message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = self._now()
         self._diagnostics_publisher.publish(message)
         # The status; after the end of the run, how it ended.
         word = told.word if segment is None else told.facts["status"] or told.word

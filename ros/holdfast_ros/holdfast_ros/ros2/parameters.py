@@ -1,12 +1,8 @@
 """The node's parameters: the settings' own keys, and a few of the node's.
 
-Every setting is a parameter of its key's name (``particle_filter.num_particles``); what is not
-given is the configuration file's value or, without one there, the default. ROS's parameters know no
-null, for which an empty text stands, and no list of mappings, for which there is ``assignments``,
-each ``SECTION.KEY=YAML``, as ``holdfast run --set`` has it.
-
-Values are checked by the settings' own code: a parameter may have any type, and errors are reported
-when the node is configured, with key, value and limit.
+What is not given is the configuration file's value or, without one there, the default. ROS's
+parameters know no null, for which an empty text stands, and no list of mappings, for which there is
+``assignments``. Values are checked by the settings' own code when the node is configured.
 """
 
 from __future__ import annotations
@@ -29,8 +25,6 @@ _SECTIONS_OF_PROBLEMS = ("model.", "state_space_planner.")
 _ARGUMENTS = "environment.arguments."
 _OF_ROS = ("use_sim_time", "start_type_description_service")
 _OF_ROS_SECTIONS = ("qos_overrides.",)
-
-
 _Text = Annotated[str, msgspec.Meta(max_length=4096)]
 
 
@@ -80,8 +74,7 @@ OWN: Mapping[str, str] = {
     "decide_timeout_s": "a call of ~/decide is answered within this time, s",
     "pause_timeout_s": "how long a run that is to be held waits for the robot, s",
     "belief_rate_hz": "beliefs published a second, at most",
-    "publish_entropies": "whether to compute the entropies of each decision once more, to publish "
-    "them",
+    "publish_entropies": "whether to compute each decision's entropies once more and publish them",
     "bond_heartbeat_period": "period of the heartbeat for Nav2's lifecycle manager, s; 0: none. "
     "It needs the package bond",
 }
@@ -95,7 +88,6 @@ _OBJECTS = {
 }
 """What the run's configuration names, so that no other world goes on with that run."""
 
-
 _FOR_OPTIONS = {
     " (--resume)": "",
     " (--trials)": "",
@@ -107,27 +99,16 @@ _FOR_OPTIONS = {
 
 
 class NodeParameters(NamedTuple):
-    """What the parameters come to.
-
-    Attributes
-    ----------
-    run_directory : Path
-        Absolute.
-    """
+    """What the parameters come to."""
 
     own: OwnParameters
     configuration: Configuration
-    run_directory: Path
+    run_directory: Path  # absolute
 
 
 def known_parameters() -> dict[str, str]:
     """Return what each parameter means, by name; those of the problem's own sections excepted."""
-    return {**OWN, **_settings_keys()}
-
-
-def _settings_keys() -> dict[str, str]:
-    """Return what is allowed and the default, for each ``section.key`` that no problem changes."""
-    keys = {}
+    keys = dict(OWN)
     for section, schema in SETTINGS.items():
         defaults = msgspec.to_builtins(schema())
         for item in msgspec.inspect.type_info(schema).fields:  # type: ignore[attr-defined]
@@ -146,10 +127,8 @@ def in_parameters(text: str) -> str:
 def read_parameters(values: Mapping[str, Any]) -> NodeParameters:
     """Check the parameters, and load the configuration that they make.
 
-    ``values`` are plain data by the parameter's name; None means not given.
-
-    Raises HoldfastError if a value cannot be used; the message names the parameter, the value and
-    what is allowed.
+    ``values`` are plain data by the parameter's name; None means not given. Raises HoldfastError if
+    a value cannot be used.
     """
     given = {name: value for name, value in values.items() if value is not None}
     of_own = {name: given[name] for name in OWN if name in given}

@@ -1,7 +1,6 @@
 """A segment of a run, on its own thread: from the end of the journal until all trials are done.
 
-A segment ends early when it is paused or something fails. The next segment continues there, in this
-process or another one.
+It ends early when it is paused or something fails. The next one continues there.
 """
 
 from __future__ import annotations
@@ -29,6 +28,7 @@ from holdfast.errors import (
 from holdfast.journal.run_directory import RunDirectory
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import PlanningState
+from holdfast.problems.problem import Problem
 from holdfast.protocol.robot_events import Act, Sense, Timing
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.health import Condition
@@ -39,33 +39,24 @@ from holdfast.runtime.events import EventSink
 from holdfast_ros.executive import DecideCode, DecisionHandover, ExecutiveEnvironment
 from holdfast_ros.ros2.parameters import NodeParameters, in_parameters
 
-MAX_TRIALS_TOLD = 10_000
-"""Most trials in a result; ``trials.csv`` has all."""
-
-_INTERRUPTED_S = 2.0
-"""For a call of the environment that was interrupted to end."""
-
+MAX_TRIALS_TOLD = 10_000  # in a result; trials.csv has all
+_INTERRUPTED_S = 2.0  # for a call of the environment that was interrupted to end
 _CANNOT_GO_ON = (UnknownPerformanceError, LostJournalError, StaleEpochError)
 
 
 class Ending(enum.IntEnum):
     """How a segment ended."""
 
-    FINISHED = 0
-    """All trials are finished."""
-    PAUSED = 1
-    """It was asked to pause."""
-    HELD = 2
-    """An error; the run can continue once its cause is gone."""
-    FAILED = 3
-    """An error; the run cannot continue."""
+    FINISHED = 0  # all trials are finished
+    PAUSED = 1  # it was asked to pause
+    HELD = 2  # an error; the run can continue once its cause is gone
+    FAILED = 3  # an error; the run cannot continue
 
 
 class SegmentResult(NamedTuple):
-    """The result of a segment, the trials of earlier segments included.
+    """How a segment ended, with the first finished trials of this and earlier segments.
 
-    ``trials`` are the first :data:`MAX_TRIALS_TOLD` finished ones; ``status`` is empty if the robot
-    had not started.
+    ``status`` is empty if the robot had not started.
     """
 
     ending: Ending
@@ -76,65 +67,53 @@ class SegmentResult(NamedTuple):
 
 
 class World(NamedTuple):
-    """What a segment acts on.
-
-    ``interrupt`` gets a reason and ends the environment's current call where possible. A pause does
-    so at once if an interrupted call is repeated later, so that it costs nothing. ``handover`` is
-    where calls of ``~/decide`` meet the run; None where the node itself performs.
-    """
+    """What a segment acts on."""
 
     maker: EnvironmentMaker
-    interrupt: Callable[[str], None]
-    interrupt_at_once: bool = False
-    handover: DecisionHandover | None = None
+    interrupt: Callable[[str], None]  # ends the current call where possible, for a reason
+    interrupt_at_once: bool = False  # an interrupted call is repeated later, so it costs nothing
+    handover: DecisionHandover | None = None  # where calls of ~/decide meet the run
 
 
 def make_world(connections: Any, parameters: NodeParameters) -> World:
-    """Make what the parameters name, for one segment of a run.
-
-    Raises HoldfastError if that cannot be; the message names the parameter.
-    """
+    """Make what the parameters name, for one segment of a run."""
     configuration, own = parameters.configuration, parameters.own
     if own.environment == "configuration":
         return World(load_environment(configuration), lambda _: None)
+    settings, seed = configuration.environment, configuration.simulator.seed
     # Other threads than the robot's use it.
     problem = Configuration.from_plain(configuration.plain()).problem
-    handover = DecisionHandover(problem) if own.environment == "executive" else None
-    timeout_ms = configuration.environment.timeout_ms
-    make: Any
-    if handover is not None:
-        make = functools.partial(ExecutiveEnvironment, handover)
-    else:
-        from holdfast_ros.ros2_environment import Ros2Environment
 
-        make = functools.partial(
-            Ros2Environment,
-            connections,
-            act=own.act,
-            timeout_ms=timeout_ms,
-            discovery_timeout_ms=own.discovery_timeout_ms,
+    def maker(name: str, problem: Problem, make: Any) -> EnvironmentMaker:
+        missing = settings.max_missing_in_a_row
+        return EnvironmentMaker(
+            name, problem, seed, settings.timeout_ms, make, max_missing_in_a_row=missing
         )
-    maker = EnvironmentMaker(
-        "the executive" if handover else "the robot",
-        configuration.problem if handover else problem,
-        configuration.simulator.seed,
-        timeout_ms,
-        make,
-        max_missing_in_a_row=configuration.environment.max_missing_in_a_row,
+
+    if own.environment == "executive":
+        handover = DecisionHandover(problem)
+        make: Any = functools.partial(ExecutiveEnvironment, handover)
+        interrupt = functools.partial(handover.end, DecideCode.ENDED)
+        executive = maker("the executive", configuration.problem, make)
+        return World(executive, interrupt, interrupt_at_once=True, handover=handover)
+    from holdfast_ros.ros2_environment import Ros2Environment
+
+    make = functools.partial(
+        Ros2Environment,
+        connections,
+        act=own.act,
+        timeout_ms=settings.timeout_ms,
+        discovery_timeout_ms=own.discovery_timeout_ms,
     )
-    if handover is None:
-        return World(maker, lambda _: connections.cancel())
-    ended = functools.partial(handover.end, DecideCode.ENDED)
-    return World(maker, ended, interrupt_at_once=True, handover=handover)
+    return World(maker("the robot", problem, make), lambda _: connections.cancel())
 
 
 @dataclass(eq=False, kw_only=True)
 class RunSegment:
     """Runs the remaining trials of the run in the directory ``path``, once it is started.
 
-    ``on_order`` and ``on_timing`` are those of a
-    :class:`~holdfast.robot.robot_run.RobotObserver`; ``on_end`` gets the result, on the
-    segment's thread. ``outcome`` is there when ``ended`` is set.
+    ``on_order`` and ``on_timing`` are those of a :class:`RobotObserver`; ``on_end`` gets the
+    result, on the segment's thread. ``outcome`` is there when ``ended`` is set.
     """
 
     configuration: Configuration
@@ -152,34 +131,30 @@ class RunSegment:
         self._process: RobotProcess | None = None
         self._why_paused: str | None = None
         self._pause_within_s = 0.0
-        self._thread = threading.Thread(target=self._work, name="robot", daemon=True)
         self.ended = threading.Event()
         self.outcome: SegmentResult | None = None
         self.num_finished = 0
 
     def start(self) -> None:
         """Begin."""
-        self._thread.start()
+        threading.Thread(target=self._work, name="robot", daemon=True).start()
 
     def condition(self) -> Condition | None:
         """Return how the robot is doing; None before it runs."""
-        process = self._process
-        return None if process is None else process.condition()
+        return None if self._process is None else self._process.condition()
 
     @property
     def status(self) -> str:
         """Who decides."""
-        process = self._process
-        return "" if process is None else process.robot.status.value
+        return "" if self._process is None else self._process.robot.status.value
 
     @property
     def unexplained_observations(self) -> int:
         """Those of the trial that is running."""
-        process = self._process
-        return 0 if process is None else process.robot.unexplained_observations
+        return 0 if self._process is None else self._process.robot.unexplained_observations
 
     def pause(self, why: str, within_s: float) -> None:
-        """End in order, from any thread: :attr:`ended` says when. Only the first call counts.
+        """End in order, from any thread; only the first call counts.
 
         The environment has ``within_s`` to end its current call, which is then interrupted, and
         abandoned if that does not help.
@@ -195,13 +170,12 @@ class RunSegment:
         if self.world.interrupt_at_once:
             self.world.interrupt(why)
         else:
-            threading.Thread(
-                target=self._interrupt_later, args=(why, within_s), name="pause", daemon=True
-            ).start()
 
-    def _interrupt_later(self, why: str, within_s: float) -> None:
-        if not self.ended.wait(within_s):
-            self.world.interrupt(why)
+            def interrupt_later() -> None:
+                if not self.ended.wait(within_s):
+                    self.world.interrupt(why)
+
+            threading.Thread(target=interrupt_later, name="pause", daemon=True).start()
 
     def _take_process(self, process: RobotProcess) -> None:
         with self._changed:
@@ -218,14 +192,16 @@ class RunSegment:
                 finally:
                     trials = tuple(itertools.islice(directory.journal.results(), MAX_TRIALS_TOLD))
                 complete = self.num_finished >= self.configuration.simulator.num_trials
-            if complete:
-                result = SegmentResult(Ending.FINISHED, f"{self.num_finished} trials", trials)
-            else:
-                result = SegmentResult(Ending.PAUSED, self._why_paused or "paused", trials)
+            ending = Ending.FINISHED if complete else Ending.PAUSED
+            message = f"{self.num_finished} trials" if complete else self._why_paused or "paused"
+            result = SegmentResult(ending, message, trials)
         except HoldfastError as error:
-            result = SegmentResult(self._ending_of(error), in_parameters(str(error)), trials)
-            if result.ending == Ending.PAUSED:
-                result = result._replace(message=self._why_paused or result.message)
+            # An interrupted call reports a failure.
+            why = self._why_paused if isinstance(error, HeldError) else None
+            is_final = isinstance(error, _CANNOT_GO_ON)
+            ending = Ending.FAILED if is_final else Ending.HELD if why is None else Ending.PAUSED
+            message = why if ending == Ending.PAUSED and why else in_parameters(str(error))
+            result = SegmentResult(ending, message, trials)
         except BaseException:  # noqa: BLE001 - waiting callers need a result
             result = SegmentResult(Ending.FAILED, traceback.format_exc(), trials)
         result = result._replace(status=self.status, num_finished=self.num_finished)
@@ -234,13 +210,6 @@ class RunSegment:
             self.on_end(result)
         finally:
             self.ended.set()
-
-    def _ending_of(self, error: HoldfastError) -> Ending:
-        if isinstance(error, _CANNOT_GO_ON):
-            return Ending.FAILED
-        # An interrupted call reports a failure.
-        paused = self._why_paused is not None and isinstance(error, HeldError)
-        return Ending.PAUSED if paused else Ending.HELD
 
     def _run(self, directory: RunDirectory) -> None:
         self.num_finished = sum(1 for _ in directory.journal.results())
@@ -252,17 +221,13 @@ class RunSegment:
             directory.add(result)
             self.num_finished += 1
 
-        observer = RobotObserver(self._take_process, self.on_order, self.on_timing)
         try:
             perform_trials(
-                self.configuration,
-                directory,
-                self.world.maker,
-                on_result,
+                *(self.configuration, directory, self.world.maker, on_result),
                 rate_hz=self.rate_hz,
                 after_reboot=self.after_reboot,
                 sinks=[self.sink],
-                observer=observer,
+                observer=RobotObserver(self._take_process, self.on_order, self.on_timing),
             )
         except BaseException:
             # If the disk is the trouble, the first error says so.

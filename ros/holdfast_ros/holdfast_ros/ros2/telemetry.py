@@ -1,11 +1,9 @@
 """A robot's decisions and beliefs for observers, without delaying a decision.
 
-The robot's loop only notes each order, which takes a microsecond. A thread of low priority makes
-messages of the notes. If it falls behind, it drops beliefs first (they hold memory), their
-entropies with them, and then the oldest decisions. The robot never waits.
-
-A service's answer lacks the entropies behind a sensing action. As every decision is a function of
-the state, they are recomputed here, with a separate instance of the problem.
+The robot's loop only notes each order. A thread of low priority makes messages of the notes. If it
+falls behind, it drops beliefs first (they hold memory), their entropies with them, and then the
+oldest decisions. A service's answer lacks the entropies behind a sensing action. As every decision
+is a function of the state, they are recomputed here, with a separate instance of the problem.
 """
 
 from __future__ import annotations
@@ -28,16 +26,13 @@ from holdfast.protocol.robot_events import Act, Sense, Timing
 from holdfast.protocol.status import Status
 from holdfast.robot.links import RECOVERY_SERVICE
 
-_MAX_STATE_BYTES = 32 << 20
-_MIN_STATES = 4
+_MAX_STATE_BYTES, _MIN_STATES = 32 << 20, 4
 """Notes keep their states up to this memory, the last four in any case."""
 
-_LATE_S = 1.0
-"""A belief that is older than this is shown no more."""
-
+_LATE_S = 1.0  # a belief that is older than this is shown no more
 _MAX_NOTES = 1000
-
 _NICENESS = 10
+_NOTHING: FloatArray = np.empty(0)
 
 _ENTROPIES = ("action_entropy", "path_entropy", "state_entropy", "action_covariance")
 """Methods that compute something for each sensing action; the others only choose. (What
@@ -46,32 +41,18 @@ _ENTROPIES = ("action_entropy", "path_entropy", "state_entropy", "action_covaria
 
 @dataclass(slots=True)
 class PublishedDecision:
-    """An order to the environment, for people.
-
-    Attributes
-    ----------
-    sensing_action : int or None
-        None for a task action.
-    entropies : array of shape (J,)
-        Empty if they were not computed.
-    task_action : array of shape (action_size,)
-        Empty for a sensing action.
-    state : PlanningState or None
-        In which it was decided; None if there was no time for it.
-    noted_at : float
-        On the monotonic clock, in seconds.
-    """
+    """An order to the environment, for people."""
 
     trial: int
     step: int
     stage: int
-    sensing_action: int | None
-    entropies: FloatArray
-    task_action: FloatArray
+    sensing_action: int | None  # None for a task action
+    entropies: FloatArray  # of shape (J,); empty if they were not computed
+    task_action: FloatArray  # of shape (action_size,); empty for a sensing action
     status: str
     decided_by: str
-    state: PlanningState | None
-    noted_at: float
+    state: PlanningState | None  # in which it was decided; None if there was no time for it
+    noted_at: float  # on the monotonic clock, in seconds
 
 
 class Telemetry:
@@ -92,8 +73,9 @@ class Telemetry:
         belief_rate_hz: float,
         wants_entropies: Callable[[], bool],
     ) -> None:
-        self._problem = Configuration.from_plain(configuration.plain()).problem
-        self._settings = configuration.planning
+        problem = Configuration.from_plain(configuration.plain()).problem
+        self._planner = Planner(problem, configuration.planning)
+        self._has_entropies = configuration.planning.selector.method in _ENTROPIES
         self._on_order = on_order
         self._on_belief = on_belief
         self._on_notice = on_notice
@@ -113,14 +95,11 @@ class Telemetry:
         self._thread.start()
 
     def decided_in(self, status: str) -> str:
-        """Return who decides in this status; empty before its first decision.
-
-        In local recovery the robot may still use an answer that the service which died had given:
-        it decides no more.
-        """
+        """Return who decides in this status; empty before its first decision."""
         timing = self._decided_last
         if timing is None or timing.status != status:
             return ""
+        # The robot may still use an answer of the service that has died: it decides no more.
         is_left = status == Status.LOCAL_RECOVERY.value and timing.service != RECOVERY_SERVICE
         return "" if is_left else timing.service
 
@@ -132,17 +111,15 @@ class Telemetry:
 
     def order(self, state: PlanningState, order: Act | Sense, status: str) -> None:
         """Take note of an order; returns at once."""
+        sensing_action, task_action, kind = None, _NOTHING, "sensing"
+        if isinstance(order, Sense):
+            sensing_action = order.sensing_action
+        else:
+            task_action, kind = order.action, "task"
+        place = state.trial, state.step, state.stage
+        who = self._decided_by[kind]
         note = PublishedDecision(
-            state.trial,
-            state.step,
-            state.stage,
-            order.sensing_action if isinstance(order, Sense) else None,
-            np.empty(0),
-            np.empty(0) if isinstance(order, Sense) else order.action,
-            status,
-            self._decided_by["sensing" if isinstance(order, Sense) else "task"],
-            state,
-            monotonic(),
+            *place, sensing_action, _NOTHING, task_action, status, who, state, monotonic()
         )
         keep = max(_MIN_STATES, _MAX_STATE_BYTES // max(1, state.belief.states.nbytes))
         with self._changed:
@@ -197,10 +174,9 @@ class Telemetry:
         if state is not None and monotonic() >= self._next_belief:
             self._next_belief = monotonic() + self._belief_every_s
             self._on_belief(state)
-        sensing = state is not None and shown.sensing_action is not None
-        if sensing and self._settings.selector.method in _ENTROPIES and self._wants_entropies():
-            assert state is not None
-            _, info = Planner(self._problem, self._settings).choose_sensing_action(state)
+        is_chosen = self._has_entropies and shown.sensing_action is not None
+        if state is not None and is_chosen and self._wants_entropies():
+            _, info = self._planner.choose_sensing_action(state)
             if info.entropies is not None:
                 shown.entropies = info.entropies
         self._on_order(shown)
