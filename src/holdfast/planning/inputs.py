@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.errors import MessageError, RecordError
+from holdfast.errors import MessageError
 from holdfast.numerics import reproducible as numerics
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import ObservationInfo
@@ -100,22 +100,6 @@ Input: TypeAlias = CatchUpInput | Late | Reinitialised
 """What a belief rests on, besides the task actions, which follow from it."""
 
 Record: TypeAlias = Input | ActingRecord | PausedRecord | LocalTookOverRecord
-
-_ENCODER = msgspec.msgpack.Encoder()
-_DECODER: msgspec.msgpack.Decoder[Record] = msgspec.msgpack.Decoder(Record)
-
-
-def encode_record(record: Record) -> bytes:
-    """Encode a record."""
-    return _ENCODER.encode(record)
-
-
-def decode_record(data: bytes) -> Record:
-    """Decode a record; raise RecordError if the bytes are not a record."""
-    try:
-        return _DECODER.decode(data)
-    except Exception as error:  # decoding may raise anything
-        raise RecordError(f"{len(data)} bytes are no record of a journal: {error}") from error
 
 
 def fold(
