@@ -17,8 +17,8 @@ from holdfast.config.loader import Configuration, load
 from holdfast.planning.belief import Belief
 from holdfast.planning.inputs import Late, encode_floats
 from holdfast.planning.outcome import TrialResult
+from holdfast.protocol.robot_events import Timing
 from holdfast.reports.facts import (
-    Decider,
     EventFact,
     LateFact,
     SensingFact,
@@ -39,7 +39,7 @@ def own_path(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", sys.path.copy())
 
 
-DECIDER = Decider("tcp/10.0.0.7:7447", "local_recovery", 1.0, 2.0, 3.0)
+DECIDER = Timing(0, 0, "task", "tcp/10.0.0.7:7447", "local_recovery", 1.0, 2.0, 3.0)
 MS = 1_000_000
 
 

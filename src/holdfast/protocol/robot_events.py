@@ -194,7 +194,7 @@ class LogEvent(NamedTuple):
 
 
 class Timing(NamedTuple):
-    """How long a decision took; for the tables only."""
+    """Who made a decision, and how long it took; for the tables only."""
 
     trial: int
     step: int
@@ -202,8 +202,10 @@ class Timing(NamedTuple):
     service: str  # whose answer is used
     status: str
     waited_ms: float  # how long the robot stood still for it
-    round_trip_ms: float  # from the request to the answer
-    computed_ms: float  # the service's part of that
+    # From the request to the answer, and the service's part of that; in reports None for an action
+    # that came in the answer to an earlier request.
+    round_trip_ms: float | None
+    computed_ms: float | None
 
 
 class EndTrial(NamedTuple):

@@ -14,6 +14,7 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
 from holdfast.planning.inputs import numbers_of
 from holdfast.planning.outcome import TrialResult
+from holdfast.protocol.robot_events import Timing
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep
 
 SCORES = {
@@ -25,21 +26,8 @@ SCORES = {
 }
 """What a fact's entropies are, by the method that weighs them, in two lines."""
 
-
-class Decider(NamedTuple):
-    """Who made a decision, and how long it took; from ``timings.csv``."""
-
-    service: str
-    status: str
-    waited_ms: float  # how long the robot stood still for it
-    # None for an action that came in the answer to an earlier request.
-    round_trip_ms: float | None
-    computed_ms: float | None
-
-    @classmethod
-    def of(cls, answer: Any) -> Decider:
-        """Return that of a ``Timing``, or of a row of the table."""
-        return cls(*(getattr(answer, name) for name in cls._fields))
+DECIDER = ("service", "status", "waited_ms", "round_trip_ms", "computed_ms")
+"""What of a fact's decider, the row of ``timings.csv``, stands beside the decision."""
 
 
 class TrialBeginFact(NamedTuple):
@@ -56,7 +44,7 @@ class SensingFact(NamedTuple):
     # When it was chosen, and when its observation was part of the belief.
     decided_ns: int
     observed_ns: int
-    decider: Decider | None
+    decider: Timing | None
 
 
 class TaskFact(NamedTuple):
@@ -64,7 +52,7 @@ class TaskFact(NamedTuple):
 
     step: TaskStep
     time_ns: int
-    decider: Decider | None
+    decider: Timing | None
     true_state: FloatArray | None = None  # before the action
 
     @property

@@ -179,7 +179,7 @@ def _add_timeline(
     page: HtmlPage, decisions: Sequence[TimingRow], events: Sequence[EventFact]
 ) -> None:
     """Add waits and events over time, and a table of the longest waits."""
-    longest = sorted(decisions, key=lambda row: -row.waited_ms)[: _DECISIONS // 4]
+    longest = sorted(decisions, key=lambda row: -row.timing.waited_ms)[: _DECISIONS // 4]
     shown = {id(row): row for row in [*longest, *_thinned(decisions, _DECISIONS)]}
     happened = [each for each in events if each.name != "trial"]
     bad = [each for each in happened if severity(each.name, each.fields) != "INFO"]
@@ -192,15 +192,15 @@ def _add_timeline(
 
     points = [
         {
-            "t": seconds(row.time_ns),
-            "waited": round(row.waited_ms, 3),
-            "service": one_line(row.service)[:40],
-            "status": one_line(row.status)[:40],
-            "trial": min(row.trial, _MOST),
-            "step": min(row.step, _MOST),
-            "kind": one_line(row.kind)[:40],
+            "t": seconds(time_ns),
+            "waited": round(each.waited_ms, 3),
+            "service": one_line(each.service)[:40],
+            "status": one_line(each.status)[:40],
+            "trial": min(each.trial, _MOST),
+            "step": min(each.step, _MOST),
+            "kind": one_line(each.kind)[:40],
         }
-        for row in shown.values()
+        for each, time_ns, _ in shown.values()
     ]
     ticks = [
         {
@@ -226,8 +226,8 @@ def _add_timeline(
     page.table(
         head,
         [
-            (f"{each.waited_ms:.1f}", seconds(each.time_ns), *each[:5])
-            for each in longest[:8]
+            (f"{each.waited_ms:.1f}", seconds(time_ns), *each[:5])
+            for each, time_ns, _ in longest[:8]
             if each.waited_ms > 0.0
         ],
     )

@@ -23,10 +23,11 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
 from holdfast.planning.planner import PlanningState
 from holdfast.problems.attributes import choice_labels
+from holdfast.protocol.robot_events import Timing
 from holdfast.protocol.status import Status
 from holdfast.reports.csv_export import state_labels
 from holdfast.reports.facts import (
-    Decider,
+    DECIDER,
     EventFact,
     LateFact,
     SensingFact,
@@ -326,13 +327,13 @@ class McapSink:
         now: int,
         state: PlanningState,
         kind: str,
-        decider: Decider | None,
+        decider: Timing | None,
         facts: Mapping[str, Any],
     ) -> None:
         status = "decided" if decider is None else decider.status
         entries: dict[str, Any] = {"trial": state.trial, "step": state.step, **facts}
         if decider is not None:
-            entries |= decider._asdict()
+            entries |= {name: getattr(decider, name) for name in DECIDER}
         level, message = 0, status
         if decider is not None and decider.status == Status.LOCAL_RECOVERY.value:
             level = 1

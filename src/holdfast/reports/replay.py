@@ -34,8 +34,8 @@ from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.outcome import TaskDecision, TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.printable import one_line
+from holdfast.protocol.robot_events import Timing
 from holdfast.reports.facts import (
-    Decider,
     EventFact,
     FactSink,
     LateFact,
@@ -166,13 +166,13 @@ class RecordedRun:
         trial, steps = facts.trial, sum(isinstance(each, TaskDecision) for each in facts.expected)
         rows = self._rows.get(trial, {}) if self.has_times else {}
         times = clock.next_trial(steps, rows, self._ends.get(trial))
-        deciders = {key: Decider.of(row) for key, row in rows.items()}
-        current: Decider | None = None
+        deciders = {key: row.timing for key, row in rows.items()}
+        current: Timing | None = None
         for step in range(steps):
             asked = deciders.get((step, "task"))
             if asked is not None:
                 # An answer has the task actions up to the next sensing step.
-                current = Decider(asked.service, asked.status, 0.0, None, None)
+                current = asked._replace(waited_ms=0.0, round_trip_ms=None, computed_ms=None)
             elif (step, "sensing") in deciders:
                 current = None
             elif current is not None:

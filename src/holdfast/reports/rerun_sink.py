@@ -27,10 +27,10 @@ from holdfast.numerics.randomness import NoiseFreeStream
 from holdfast.planning.belief import Belief, standard_deviation
 from holdfast.problems import checked
 from holdfast.problems.attributes import choice_labels, circular_states
+from holdfast.protocol.robot_events import Timing
 from holdfast.protocol.status import Status
 from holdfast.reports.csv_export import state_labels
 from holdfast.reports.facts import (
-    Decider,
     EventFact,
     LateFact,
     SensingFact,
@@ -313,7 +313,7 @@ class RerunSink:
         for marker in sensing_markers(self._problem, self._layout, _TASK, belief, sensing_action):
             self._recording.log(f"{entity}/{marker.namespace}", _shape(marker, _SENSED))
 
-    def _decider(self, decider: Decider | None) -> None:
+    def _decider(self, decider: Timing | None) -> None:
         if decider is None:
             return
         self._state("decider", decider.service)

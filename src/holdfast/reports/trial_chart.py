@@ -21,10 +21,10 @@ from holdfast.printable import one_line
 from holdfast.problems import checked
 from holdfast.problems.attributes import choice_labels, circular_states
 from holdfast.problems.problem import Scene
+from holdfast.protocol.robot_events import Timing
 from holdfast.reports.csv_export import state_labels
 from holdfast.reports.facts import (
     SCORES,
-    Decider,
     EventFact,
     LateFact,
     SensingFact,
@@ -115,7 +115,7 @@ class TrialChart:
         belief: Belief,
         estimate: FloatArray,
         truth: FloatArray | None,
-        decider: Decider | None,
+        decider: Timing | None,
         *,
         last: bool = False,
     ) -> None:
@@ -312,7 +312,7 @@ def _short(text: object) -> str:
     return line if len(line) <= _MAX_TEXT else f"{line[: _MAX_TEXT - 1]}…"
 
 
-def _by(decider: Decider | None) -> str:
+def _by(decider: Timing | None) -> str:
     if decider is None:
         return ""
     waited = f", waited {decider.waited_ms:.3g} ms" if decider.waited_ms > 0.0 else ""
