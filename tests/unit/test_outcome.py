@@ -10,13 +10,12 @@ import pytest
 from tests.recordings import failed, result_of
 
 from holdfast.errors import InvalidValueError
+from holdfast.planning.inputs import ActingRecord, Sensed, encode_floats
 from holdfast.planning.outcome import (
     TRIAL_COLUMNS,
     DecisionLog,
     Decisions,
     RewardAccount,
-    SensingDecision,
-    TaskDecision,
     TrialResult,
 )
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
@@ -36,9 +35,9 @@ def whole() -> Decisions:
 def test_what_is_noted_is_read_back() -> None:
     decisions = whole()
     assert list(decisions) == [
-        SensingDecision(0, 1, DIGEST),
-        TaskDecision(0, (0.5, -0.0)),
-        TaskDecision(1, (1e-300, 2.0)),
+        Sensed(0, 1, b"", DIGEST),
+        ActingRecord(0, encode_floats([0.5, -0.0])),
+        ActingRecord(1, encode_floats([1e-300, 2.0])),
     ]
     assert decisions.digest() == hashlib.blake2b(decisions.log, digest_size=32).hexdigest()
 

@@ -31,7 +31,8 @@ from holdfast.journal.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.journal.run_directory import recorded_configuration
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.floating_mode import in_own_mode
-from holdfast.planning.outcome import TaskDecision, TrialResult
+from holdfast.planning.inputs import ActingRecord
+from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.printable import one_line
 from holdfast.protocol.robot_events import Timing
@@ -163,7 +164,7 @@ class RecordedRun:
         return recorded.trial
 
     def _times(self, facts: _Facts, clock: StepClock) -> TrialTimes:
-        trial, steps = facts.trial, sum(isinstance(each, TaskDecision) for each in facts.expected)
+        trial, steps = facts.trial, sum(isinstance(each, ActingRecord) for each in facts.expected)
         rows = self._rows.get(trial, {}) if self.has_times else {}
         times = clock.next_trial(steps, rows, self._ends.get(trial))
         deciders = {key: row.timing for key, row in rows.items()}
