@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from tests.recordings import failed, result_of
@@ -50,6 +51,13 @@ def test_the_layout_is_pinned() -> None:
         + "41" + "0100000000000000" + np.float64(1e-300).tobytes().hex() + "0000000000000040"
         + "45" + "0200000000000000" + DIGEST.hex()
     )  # fmt: skip
+
+
+def test_a_result_in_words() -> None:
+    lost = msgspec.structs.replace(failed(result_of(990)), reason="hit a wall")
+    assert lost.in_words() == "failed after 1,000 steps, 0 sensing actions: hit a wall; reward -1"
+    quiet = msgspec.structs.replace(result_of(0), reward=None)
+    assert quiet.in_words() == "succeeded after 10 steps, 0 sensing actions"
 
 
 @pytest.mark.parametrize("length", [1, 20, 44, 50, 60, 94, 130])

@@ -133,7 +133,7 @@ def test_a_step_in_all_its_parts(tmp_path: Path) -> None:
     assert log == [
         "trial 0 begins",
         "trial 0, step 0: no particle explains the observation of θ",
-        "trial 0 succeeded after 10 steps; reward -1",
+        "trial 0 succeeded after 10 steps, 0 sensing actions; reward -1",
     ]
 
 
@@ -199,7 +199,7 @@ def test_a_late_observation_and_the_choice_not_to_sense(tmp_path: Path) -> None:
     ("outcome", "words"),
     [
         ({"success": False, "failed": True, "reason": "dropped the peg"},
-         "failed after 10 steps: dropped the peg; reward -1"),
+         "failed after 10 steps, 0 sensing actions: dropped the peg; reward -1"),
         (None, "1 steps so far; not finished"),
     ],
 )  # fmt: skip

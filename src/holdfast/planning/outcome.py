@@ -303,6 +303,14 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
             return "succeeded"
         return "failed" if self.failed else "truncated"
 
+    def in_words(self) -> str:
+        """Return what the trial came to, on one line."""
+        text = (
+            f"{self.outcome} after {self.steps:,} steps, "
+            f"{self.sensing_decisions:,} sensing actions{self.reason and f': {self.reason}'}"
+        )
+        return text if self.reward is None else f"{text}; reward {self.reward:.6g}"
+
 
 TRIAL_COLUMNS = (
     *(
@@ -314,3 +322,13 @@ TRIAL_COLUMNS = (
     "reason",
 )
 """The columns of ``trials.csv``."""
+
+COUNTS = {
+    "sensing_decisions": "sensing actions",
+    "missing_observations": "missing observations",
+    "unexplained_observations": "observations that no particle explains",
+    "lost": "times that the robot was found lost",
+    "suspect_sensors": "sensors found suspect",
+    "recoveries": "times that the local service took over",
+}
+"""The columns that a summary adds up, in words."""

@@ -32,6 +32,7 @@ from holdfast.reports.facts import (
     TaskFact,
     TrialBeginFact,
     TrialEndFact,
+    shown_decider,
 )
 
 TABLES = ("trials.csv", "steps.csv", "beliefs.csv", "events.csv")
@@ -206,9 +207,7 @@ def _cells(
 
 
 def _decider_cells(kind: str, decider: Timing | None) -> dict[str, Any]:
-    if decider is None:
-        return {}
-    return {f"{kind}_{name}": getattr(decider, name) for name in DECIDER}
+    return {f"{kind}_{name}": value for name, value in shown_decider(decider).items()}
 
 
 def _seconds(time_ns: int) -> str:

@@ -7,6 +7,7 @@ tables, ROS messages or arrays. All times are on one clock.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isnan
 from typing import Any, NamedTuple, Protocol
 
 from holdfast.journal.run_clock import Stamp
@@ -27,7 +28,18 @@ SCORES = {
 """What a fact's entropies are, by the method that weighs them, in two lines."""
 
 DECIDER = ("service", "status", "waited_ms", "round_trip_ms", "computed_ms")
-"""What of a fact's decider, the row of ``timings.csv``, stands beside the decision."""
+"""What of the timing of a decision, the fact's ``decider``, stands beside it."""
+
+
+def shown_decider(decider: Timing | None) -> dict[str, Any]:
+    """Return what is known of :data:`DECIDER`.
+
+    Of an action that came in the answer to an earlier request there are no times but the wait.
+    """
+    if decider is None:
+        return {}
+    known = {name: getattr(decider, name) for name in DECIDER}
+    return {name: each for name, each in known.items() if isinstance(each, str) or not isnan(each)}
 
 
 class TrialBeginFact(NamedTuple):

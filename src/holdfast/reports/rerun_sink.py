@@ -193,11 +193,8 @@ class RerunSink:
         if result is None:
             self._text("INFO", f"trial {fact.trial}: {fact.steps} steps so far; not finished")
             return
-        text = f"trial {fact.trial} {result.outcome} after {result.steps} steps"
-        text += f": {result.reason}" if result.reason else ""
-        if result.reward is not None:
-            text += f"; reward {result.reward:.6g}"
         self._state("trial", result.outcome)
+        text = f"trial {fact.trial} {result.in_words()}"
         self._text("INFO" if result.outcome == "succeeded" else "WARN", text)
         # The next trial's first step comes after this one's last belief.
         self._last += 1

@@ -33,12 +33,7 @@ from holdfast.reports.facts import (
     TrialEndFact,
 )
 from holdfast.reports.html_page import Chart, chart_part
-from holdfast.reports.scene_drawing import (
-    body_corners,
-    obstacles_within,
-    shown_part,
-    walls_at,
-)
+from holdfast.reports.scene_drawing import body_corners, obstacles_within, shown_part, walls_at
 
 MAX_PARTICLES = 80
 """Particles that are kept of a belief: evenly spread ones, if it has more."""
@@ -70,7 +65,7 @@ class TrialChart:
         plane = (0, min(1, size - 1)) if scene is None else scene.axes
         self._planes = [plane, *([] if scene is None else scene.targets)]
         self._every = -(-max(result.steps, 1) // most)
-        self._every_sensing = -(-max(result.sensing_decisions, 1) // most)
+        self._every_sensing = -(-max(len(result.sensing_ms), 1) // most)
         self.left_out = self._every > 1
         self._rows: list[dict[str, Any]] = []
         self._beliefs: list[dict[str, Any]] = []
