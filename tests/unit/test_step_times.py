@@ -13,14 +13,7 @@ from holdfast.errors import OutputError
 from holdfast.journal.run_clock import RunClock
 from holdfast.journal.timings import TimingRow, rows_by_trial
 from holdfast.protocol.robot_events import Timing
-from holdfast.reports.step_times import (
-    MOMENTS,
-    NS_PER_S,
-    StepClock,
-    dated,
-    read_events,
-    trial_ends,
-)
+from holdfast.reports.step_times import MOMENTS, NS_PER_S, StepClock, dated, read_events, trial_ends
 
 
 def row(step: int, kind: str, time_ns: int) -> TimingRow:

@@ -15,12 +15,7 @@ from holdfast.config.loader import Configuration, load
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.inputs import ActingRecord, Sensed, encode_floats
-from holdfast.planning.outcome import (
-    DONE_VALUES,
-    Decisions,
-    MoveResult,
-    TrialResult,
-)
+from holdfast.planning.outcome import DONE_VALUES, Decisions, MoveResult, TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D

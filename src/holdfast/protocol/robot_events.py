@@ -202,10 +202,8 @@ class Timing(NamedTuple):
     service: str  # whose answer is used
     status: str
     waited_ms: float  # how long the robot stood still for it
-    # From the request to the answer, and the service's part of that; in reports None for an action
-    # that came in the answer to an earlier request.
-    round_trip_ms: float | None
-    computed_ms: float | None
+    round_trip_ms: float  # from the request to the answer
+    computed_ms: float  # the service's part of that
 
 
 class EndTrial(NamedTuple):

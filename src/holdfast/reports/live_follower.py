@@ -23,13 +23,7 @@ from holdfast.journal.journal_reader import JournalReader, decode_records, decod
 from holdfast.journal.run_directory import EVENTS_NAME, TIMINGS_NAME
 from holdfast.journal.timings import TimingRow, timings_of
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning.inputs import (
-    ActingRecord,
-    Late,
-    Moved,
-    Record,
-    Sensed,
-)
+from holdfast.planning.inputs import ActingRecord, Late, Moved, Record, Sensed
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.tracking import Trial

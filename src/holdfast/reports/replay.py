@@ -20,12 +20,7 @@ from pathlib import Path
 from typing import Self
 
 from holdfast.config.loader import Configuration
-from holdfast.errors import (
-    DecidedOtherwiseError,
-    HoldfastError,
-    OutputError,
-    UntrustedCodeError,
-)
+from holdfast.errors import DecidedOtherwiseError, HoldfastError, OutputError, UntrustedCodeError
 from holdfast.journal.fingerprint import difference, fingerprint
 from holdfast.journal.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.journal.run_directory import recorded_configuration
@@ -46,12 +41,7 @@ from holdfast.reports.facts import (
     TrialEndFact,
 )
 from holdfast.reports.recorder import true_state
-from holdfast.reports.step_times import (
-    StepClock,
-    TrialTimes,
-    read_times,
-    trial_ends,
-)
+from holdfast.reports.step_times import StepClock, TrialTimes, read_times, trial_ends
 from holdfast.robot.environment import Environment
 from holdfast.robot.recomputing import ComparedTrial, RecordedTrials
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep
@@ -173,7 +163,9 @@ class RecordedRun:
             asked = deciders.get((step, "task"))
             if asked is not None:
                 # An answer has the task actions up to the next sensing step.
-                current = asked._replace(waited_ms=0.0, round_trip_ms=None, computed_ms=None)
+                current = asked._replace(
+                    waited_ms=0.0, round_trip_ms=math.nan, computed_ms=math.nan
+                )
             elif (step, "sensing") in deciders:
                 current = None
             elif current is not None:
