@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from holdfast.planning.outcome import SensingDecision
+from holdfast.planning.inputs import Sensed
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import PlanningSettings, SelectorSettings
 from holdfast.robot.trial import run_trial
@@ -81,7 +81,7 @@ def test_below_its_resolution_the_sharp_sensor_is_worth_nothing() -> None:
             decision.sensing_action
             for trial in range(5)
             for decision in run_trial(planner, 3, trial, max_steps=60).decisions or ()
-            if isinstance(decision, SensingDecision)
+            if isinstance(decision, Sensed)
         ]
         shares.append(sum(looks) / len(looks))
     assert shares[0] < 0.1

@@ -22,9 +22,10 @@ from holdfast.errors import (
     FrameError,
     InvalidValueError,
     MessageError,
-    RecordError,
 )
-from holdfast.planning.inputs import MAX_INPUTS, decode_record, encode_record
+from holdfast.journal import journal_file
+from holdfast.journal.journal_reader import decode_records
+from holdfast.planning.inputs import MAX_INPUTS
 from holdfast.planning.planner import Planner, decode_checkpoint, digest, encode_checkpoint
 from holdfast.problems.problem import Problem
 from holdfast.protocol.messages import (
@@ -38,6 +39,7 @@ from holdfast.protocol.messages import (
 from holdfast.transport.frames import WIRE_VERSION, decode_hello
 
 _HELLO_BEGINS = len(MAGIC) + len(frame_of(0))
+_LIST_OF_ONE = b"\x91"
 
 _CODES = ("malformed", "version", "too_large", "other_code")
 
@@ -77,13 +79,13 @@ def check_reply(data: bytes) -> None:
 
 
 def check_record(data: bytes) -> None:
-    """Check ``decode_record``."""
+    """Check ``decode_records``, of a list of one."""
     try:
-        decoded = decode_record(data)
-    except RecordError:
+        decoded = decode_records(_LIST_OF_ONE + data)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):  # what says: damaged
         return
-    again = encode_record(decoded)
-    assert encode_record(decode_record(again)) == again
+    again = journal_file.encode(decoded)
+    assert journal_file.encode(decode_records(again)) == again
 
 
 @functools.cache
@@ -153,7 +155,7 @@ def _specimens() -> dict[str, list[bytes]]:
         ],
         "request": [corpus.content_of(each) for each in corpus.requests()],
         "reply": [corpus.content_of(each) for each in corpus.replies()],
-        "record": [encode_record(each) for each in corpus.records()],
+        "record": [journal_file.encode(each) for each in corpus.records()],
         "checkpoint": corpus.checkpoints(),
         "configuration": corpus.configurations(),
     }

@@ -12,7 +12,9 @@ from tests.fuzz.examples import always, examples
 from tests.fuzz.mutations import Mutator
 from tests.fuzz.targets import SPECIMENS, TARGETS
 
-from holdfast.planning.inputs import Record, decode_record, encode_record
+from holdfast.journal import journal_file
+from holdfast.journal.journal_reader import decode_records
+from holdfast.planning.inputs import Record
 from holdfast.planning.planner import PlanningState, decode_checkpoint, digest, encode_checkpoint
 from holdfast.printable import one_line
 from holdfast.protocol.messages import Refused, Reply, Request, decode_reply, decode_request, encode
@@ -43,7 +45,7 @@ def test_a_reply_survives_its_journey(examples: int) -> None:
 @examples(quick=40, slow=4_000)
 def test_a_record_survives_its_journey(examples: int) -> None:
     def check(record: Record) -> None:
-        assert decode_record(encode_record(record)) == record
+        assert decode_records(journal_file.encode([record])) == [record]
 
     always(examples, check, strategies.records)
 
@@ -77,7 +79,7 @@ def test_a_message_of_any_content_that_is_spoilt(encoded: str, examples: int) ->
     drawn: dict[str, st.SearchStrategy[bytes]] = {
         "request": strategies.requests.map(corpus.content_of),
         "reply": strategies.replies.map(corpus.content_of),
-        "record": strategies.records.map(encode_record),
+        "record": strategies.records.map(journal_file.encode),
     }
 
     def check(message: bytes, seed: int) -> None:

@@ -32,7 +32,6 @@ from holdfast.config.loader import load
 from holdfast.config.registry import BUILT_IN
 from holdfast.journal.journal import Journal
 from holdfast.planning.inputs import ActingRecord
-from holdfast.planning.outcome import TaskDecision
 from holdfast.reports.compare import compare_runs
 from holdfast_lab.testbed import processes as lab
 from holdfast_lab.testbed.driver import ServiceCommand
@@ -463,7 +462,7 @@ def assert_identical(run: Path, reference: Path) -> None:
     with Journal.read(run / "journal.bin") as journal:
         for result in journal.results(with_decisions=True):
             assert result.decisions is not None
-            steps = [each.step for each in result.decisions if isinstance(each, TaskDecision)]
+            steps = [each.step for each in result.decisions if isinstance(each, ActingRecord)]
             assert steps == list(range(result.steps))
 
 

@@ -19,7 +19,7 @@ from tests.ports import free_port
 
 from holdfast.config.loader import Configuration
 from holdfast.journal.journal import Journal
-from holdfast.planning.outcome import TaskDecision
+from holdfast.planning.inputs import ActingRecord
 from holdfast.robot.environment import SimulatedEnvironment
 
 PATIENCE_S = 180.0
@@ -97,9 +97,9 @@ class World:
         with Journal.read(reference / "journal.bin") as journal:
             for trial in sorted(journal.finished()):
                 expected = [
-                    np.array(decision.action).tobytes()
+                    decision.action
                     for decision in journal.decisions(trial)
-                    if isinstance(decision, TaskDecision)
+                    if isinstance(decision, ActingRecord)
                 ]
                 assert self.performed[trial] == expected
         assert not self._hooks, "the run has passed by without these"

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import csv
+import math
 from pathlib import Path
 
 import numpy as np
 from tests.recordings import a_sensing_step, a_task_step, configuration_of, result_of
 
 from holdfast.planning.belief import Belief
+from holdfast.protocol.robot_events import Timing
 from holdfast.reports.csv_export import TABLES, CsvSink, state_labels
-from holdfast.reports.facts import (
-    Decider,
-    EventFact,
-    SensingFact,
-    TaskFact,
-    TrialBeginFact,
-    TrialEndFact,
-)
+from holdfast.reports.facts import EventFact, SensingFact, TaskFact, TrialBeginFact, TrialEndFact
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -30,7 +25,7 @@ def test_rows(tmp_path: Path) -> None:
     tables = tmp_path / "tables"
     tables.mkdir()
     belief = Belief(np.array([[0.1 + 0.2, 0.0, 1.0]]), np.array([1.0]))
-    decider = Decider("local", "standard", 1.5, None, None)
+    decider = Timing(0, 0, "sensing", "local", "standard", 1.5, math.nan, math.nan)
     with CsvSink(tables, problem) as sink:
         sink.trial_begins(TrialBeginFact(0, 1_000_000_000))
         sensed = a_sensing_step(belief, 2)

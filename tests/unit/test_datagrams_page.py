@@ -92,7 +92,7 @@ def test_limits() -> None:
         ),
         "probes of the robot: while none is answered": (
             f"{first_probes} at first, {1e3 * exchanges._FIRST_PROBE_INTERVAL_S:g} ms apart, "
-            f"then doubled pauses up to {redundancy.MAX_TIMEOUT_S:g} s"
+            f"then doubled pauses up to {exchanges.MAX_TIMEOUT_S:g} s"
         ),
         "probes of the robot: while nothing else is sent": "3 in its lease",
         "probes of the service": f"{1 / return_path._PROBE_INTERVAL_S:g} a second",

@@ -23,6 +23,7 @@ from holdfast.transport.exchanges import (
     PROBE,
     ReceivedReply,
     RobotExchange,
+    RoundTripEstimator,
     ServiceExchange,
 )
 from holdfast.transport.redundancy import Paths
@@ -667,3 +668,26 @@ class TestBounds:
         for kind in range(7):
             network.robot.received(bytes((kind, 0)) + message, network.now, datagram=datagram)
             network.service.received(bytes((kind, 0)) + message, datagram=datagram)
+
+
+class TestRoundTrips:
+    def test_as_in_the_standard(self) -> None:
+        trips = RoundTripEstimator()
+        assert trips.timeout_s == 0.2
+        trips.add(0.1)
+        assert trips.timeout_s == pytest.approx(0.1 + 4 * 0.05)
+        trips.add(0.1)
+        assert trips.timeout_s == pytest.approx(0.1 + 4 * 0.0375)
+        trips.add(0.2)
+        assert trips.smoothed_s == pytest.approx(0.1125)
+        assert trips.timeout_s == pytest.approx(0.1125 + 4 * (0.75 * 0.0375 + 0.25 * 0.1))
+
+    def test_the_margin_is_never_less_than_ten_milliseconds_nor_the_sum_more_than_a_second(
+        self,
+    ) -> None:
+        trips = RoundTripEstimator()
+        for _ in range(200):
+            trips.add(0.0002)
+        assert trips.timeout_s == pytest.approx(0.0102, abs=1e-6)
+        trips.add(30.0)
+        assert trips.timeout_s == 1.0

@@ -17,7 +17,7 @@ from holdfast.numerics.randomness import Purpose, Stream, stream
 from holdfast.planning import expected_return
 from holdfast.planning.belief import Belief
 from holdfast.planning.expected_return import rollout_returns
-from holdfast.planning.outcome import SensingDecision
+from holdfast.planning.inputs import Sensed
 from holdfast.planning.planner import Planner
 from holdfast.planning.sensing import SensingInfo, choose_sensing_action
 from holdfast.planning.settings import (
@@ -456,7 +456,7 @@ class TestSensingCosts:
         assert free.digest == paid.digest
         assert free.decisions is not None
         prices = Priced.sensing_costs
-        looks = [d.sensing_action for d in free.decisions if isinstance(d, SensingDecision)]
+        looks = [d.sensing_action for d in free.decisions if isinstance(d, Sensed)]
         assert len(looks) > 1
         assert free.reward is not None
         assert paid.reward is not None

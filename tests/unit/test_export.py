@@ -32,8 +32,8 @@ from holdfast.config.registry import BUILT_IN
 from holdfast.errors import UntrustedCodeError
 from holdfast.journal.journal import Journal
 from holdfast.planning.belief import Belief
-from holdfast.planning.inputs import ActingRecord, Moved, Sensed
-from holdfast.planning.outcome import SensingDecision, TaskDecision, TrialResult
+from holdfast.planning.inputs import ActingRecord, Moved, Sensed, encode_floats
+from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.reports.poses import PoseLayout, pose_layout
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
@@ -382,11 +382,11 @@ class TestReadBack:
             trial, step = int(row["trial"]), int(row["step"])
             if row["sensing_action"]:
                 digest = bytes.fromhex(row["state_digest"])
-                decisions[trial].append(SensingDecision(step, int(row["sensing_action"]), digest))
+                decisions[trial].append(Sensed(step, int(row["sensing_action"]), b"", digest))
             action = [
                 float(row[f"action_{index}"]) for index in range(configuration.problem.action_size)
             ]
-            decisions[trial].append(TaskDecision(step, tuple(action)))
+            decisions[trial].append(ActingRecord(step, encode_floats(action)))
         for result in results:
             assert result.decisions is not None
             assert decisions[result.trial] == list(result.decisions)

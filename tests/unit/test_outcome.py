@@ -5,18 +5,18 @@ from __future__ import annotations
 import hashlib
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from tests.recordings import failed, result_of
 
 from holdfast.errors import InvalidValueError
+from holdfast.planning.inputs import ActingRecord, Sensed, encode_floats
 from holdfast.planning.outcome import (
     TRIAL_COLUMNS,
     DecisionLog,
     Decisions,
     RewardAccount,
-    SensingDecision,
-    TaskDecision,
     TrialResult,
 )
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
@@ -36,9 +36,9 @@ def whole() -> Decisions:
 def test_what_is_noted_is_read_back() -> None:
     decisions = whole()
     assert list(decisions) == [
-        SensingDecision(0, 1, DIGEST),
-        TaskDecision(0, (0.5, -0.0)),
-        TaskDecision(1, (1e-300, 2.0)),
+        Sensed(0, 1, b"", DIGEST),
+        ActingRecord(0, encode_floats([0.5, -0.0])),
+        ActingRecord(1, encode_floats([1e-300, 2.0])),
     ]
     assert decisions.digest() == hashlib.blake2b(decisions.log, digest_size=32).hexdigest()
 
@@ -51,6 +51,13 @@ def test_the_layout_is_pinned() -> None:
         + "41" + "0100000000000000" + np.float64(1e-300).tobytes().hex() + "0000000000000040"
         + "45" + "0200000000000000" + DIGEST.hex()
     )  # fmt: skip
+
+
+def test_a_result_in_words() -> None:
+    lost = msgspec.structs.replace(failed(result_of(990)), reason="hit a wall")
+    assert lost.in_words() == "failed after 1,000 steps, 0 sensing actions: hit a wall; reward -1"
+    quiet = msgspec.structs.replace(result_of(0), reward=None)
+    assert quiet.in_words() == "succeeded after 10 steps, 0 sensing actions"
 
 
 @pytest.mark.parametrize("length", [1, 20, 44, 50, 60, 94, 130])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from holdfast.errors import MessageError
-from holdfast.planning.inputs import encode_floats
+from holdfast.planning.inputs import Moved, encode_floats
 from holdfast.planning.planner import Planner, decode_checkpoint
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
@@ -76,9 +76,14 @@ def test_actions_are_the_same_bit_for_bit() -> None:
 
 def test_its_checkpoint_is_the_state() -> None:
     asked = question()
+    whole = asked.request(bytes(16), 1, 2, None, None)
+    assert whole.checkpoint is asked.checkpoint()
     state = decode_checkpoint(asked.checkpoint())
     assert (state.seed, state.trial, state.step) == (1, 0, 0)
-    assert asked.checkpoint() is asked.checkpoint()
+    asked.inputs = (Moved(0, None, b"", b"1" * 8), Moved(1, None, b"", b"2" * 8))
+    for count in (0, 1, 2):
+        part = asked.request(bytes(16), 1, 2, count, None)
+        assert (part.inputs, part.checkpoint) == (asked.inputs[2 - count :], None)
 
 
 METHODS = [

@@ -1,12 +1,10 @@
-"""Round-trip times, copies of datagrams and the budget that they share."""
+"""Copies of datagrams and the budget that they share."""
 
 from __future__ import annotations
 
 import math
 
-import pytest
-
-from holdfast.transport.redundancy import COPY_DELAY_S, Paths, RedundantSender, RoundTripEstimator
+from holdfast.transport.redundancy import COPY_DELAY_S, Paths, RedundantSender
 
 
 class Sent:
@@ -94,26 +92,3 @@ class TestSender:
             sent.sender.send_on_stream(1, 4, b"")
             said = bytes((4, min(lost, 255)))
             assert (sent.datagrams, sent.on_stream) == ([said], [(1, said)])
-
-
-class TestRoundTrips:
-    def test_as_in_the_standard(self) -> None:
-        trips = RoundTripEstimator()
-        assert trips.timeout_s == 0.2
-        trips.add(0.1)
-        assert trips.timeout_s == pytest.approx(0.1 + 4 * 0.05)
-        trips.add(0.1)
-        assert trips.timeout_s == pytest.approx(0.1 + 4 * 0.0375)
-        trips.add(0.2)
-        assert trips.smoothed_s == pytest.approx(0.1125)
-        assert trips.timeout_s == pytest.approx(0.1125 + 4 * (0.75 * 0.0375 + 0.25 * 0.1))
-
-    def test_the_margin_is_never_less_than_ten_milliseconds_nor_the_sum_more_than_a_second(
-        self,
-    ) -> None:
-        trips = RoundTripEstimator()
-        for _ in range(200):
-            trips.add(0.0002)
-        assert trips.timeout_s == pytest.approx(0.0102, abs=1e-6)
-        trips.add(30.0)
-        assert trips.timeout_s == 1.0

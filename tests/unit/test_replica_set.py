@@ -139,7 +139,6 @@ def question_at(
         new_inputs=new_inputs,
         inputs=tuple(range(num_inputs - kept, num_inputs)),
         is_first=is_first,
-        checkpoint=lambda: b"state",
     )
     return cast(Question, made)
 
@@ -148,7 +147,8 @@ WHOLE = ((), b"state")
 
 
 def needs(service: Replica, question: Question, *, whole_state: bool) -> Any:
-    return service.catch_up(question, whole_state=whole_state)
+    lacking = service.num_lacking(question, whole_state=whole_state)
+    return WHOLE if lacking is None else (question.inputs[len(question.inputs) - lacking :], None)
 
 
 class TestWhatItNeeds:

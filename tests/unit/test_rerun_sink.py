@@ -17,8 +17,8 @@ from holdfast.config.loader import Configuration, load
 from holdfast.planning.belief import Belief
 from holdfast.planning.inputs import Late, encode_floats
 from holdfast.planning.outcome import TrialResult
+from holdfast.protocol.robot_events import Timing
 from holdfast.reports.facts import (
-    Decider,
     EventFact,
     LateFact,
     SensingFact,
@@ -39,7 +39,7 @@ def own_path(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", sys.path.copy())
 
 
-DECIDER = Decider("tcp/10.0.0.7:7447", "local_recovery", 1.0, 2.0, 3.0)
+DECIDER = Timing(0, 0, "task", "tcp/10.0.0.7:7447", "local_recovery", 1.0, 2.0, 3.0)
 MS = 1_000_000
 
 
@@ -133,7 +133,7 @@ def test_a_step_in_all_its_parts(tmp_path: Path) -> None:
     assert log == [
         "trial 0 begins",
         "trial 0, step 0: no particle explains the observation of θ",
-        "trial 0 succeeded after 10 steps; reward -1",
+        "trial 0 succeeded after 10 steps, 0 sensing actions; reward -1",
     ]
 
 
@@ -199,7 +199,7 @@ def test_a_late_observation_and_the_choice_not_to_sense(tmp_path: Path) -> None:
     ("outcome", "words"),
     [
         ({"success": False, "failed": True, "reason": "dropped the peg"},
-         "failed after 10 steps: dropped the peg; reward -1"),
+         "failed after 10 steps, 0 sensing actions: dropped the peg; reward -1"),
         (None, "1 steps so far; not finished"),
     ],
 )  # fmt: skip

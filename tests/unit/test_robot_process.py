@@ -18,8 +18,8 @@ from tests.recordings import robot_configuration
 from holdfast.config.loader import Configuration
 from holdfast.errors import HeldError, ProblemError, TrialError
 from holdfast.journal.run_directory import RunDirectory
-from holdfast.planning.inputs import Moved, PausedRecord
-from holdfast.planning.outcome import SensingDecision, TrialResult
+from holdfast.planning.inputs import Moved, PausedRecord, Sensed
+from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.protocol.question import InProcessSource
 from holdfast.protocol.robot_events import (
@@ -578,7 +578,7 @@ def test_who_looks_on_sees_each_order_and_its_state(robots: Robots) -> None:
     for result in robots.results:
         assert result.decisions is not None
         expected += [
-            (result.trial, one.step, "Sense" if isinstance(one, SensingDecision) else "Act")
+            (result.trial, one.step, "Sense" if isinstance(one, Sensed) else "Act")
             for one in result.decisions
         ]
     assert seen == expected

@@ -12,7 +12,7 @@ import pytest
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import InvalidValueError, TransportError
-from holdfast.planning.outcome import SensingDecision, TaskDecision
+from holdfast.planning.inputs import ActingRecord, Sensed, decode_floats
 from holdfast.planning.planner import Planner
 from holdfast.protocol.status import Status
 from holdfast.robot.environment import Environment, SimulatedEnvironment
@@ -95,10 +95,10 @@ def in_process(configuration: Configuration, trial: int) -> list[int | tuple[flo
     assert result.decisions is not None
     for decision in result.decisions:
         match decision:
-            case SensingDecision(_, sensing_action, _):
+            case Sensed(_, sensing_action, _):
                 made.append(sensing_action)
-            case TaskDecision(_, action):
-                made.append(action)
+            case ActingRecord(_, action):
+                made.append(tuple(decode_floats(action, None).tolist()))
     return made
 
 

@@ -17,7 +17,7 @@ from tests.unit.test_trial import configuration_of, one
 import holdfast as hf
 from holdfast.errors import HoldfastError, InvalidValueError, OutputError
 from holdfast.journal.tables import wilson_interval
-from holdfast.planning.outcome import SensingDecision
+from holdfast.planning.inputs import Sensed
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.reports.outcome_comparison import effects_of
 from holdfast.tuning.simulated_trials import Trials
@@ -55,7 +55,7 @@ def test_what_sensing_has_cost() -> None:
     planner = hf.Planner(problem, particles=30, method="random")
     decisions = hf.run_trial(planner, 3, 1, max_steps=LIMIT).decisions
     assert decisions is not None
-    looks = [each.sensing_action for each in decisions if isinstance(each, SensingDecision)]
+    looks = [each.sensing_action for each in decisions if isinstance(each, Sensed)]
     assert trials.results[1].sensing_price == pytest.approx(np.take((0.5, 0.25, 0.0), looks).sum())
     assert trials.results[1].decisions is None
     assert "sensing price" in trials.to_markdown()

@@ -12,18 +12,12 @@ import pytest
 from holdfast.errors import OutputError
 from holdfast.journal.run_clock import RunClock
 from holdfast.journal.timings import TimingRow, rows_by_trial
-from holdfast.reports.step_times import (
-    MOMENTS,
-    NS_PER_S,
-    StepClock,
-    dated,
-    read_events,
-    trial_ends,
-)
+from holdfast.protocol.robot_events import Timing
+from holdfast.reports.step_times import MOMENTS, NS_PER_S, StepClock, dated, read_events, trial_ends
 
 
 def row(step: int, kind: str, time_ns: int) -> TimingRow:
-    return TimingRow(0, step, kind, "local", "standard", 0.0, time_ns=time_ns)
+    return TimingRow(Timing(0, step, kind, "local", "standard", 0.0, 0.0, 0.0), time_ns)
 
 
 def test_without_times_every_step_takes_the_same() -> None:

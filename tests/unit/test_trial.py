@@ -14,14 +14,8 @@ from tests.line_problem import SETTINGS, Line
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning.outcome import (
-    DONE_VALUES,
-    Decisions,
-    MoveResult,
-    SensingDecision,
-    TaskDecision,
-    TrialResult,
-)
+from holdfast.planning.inputs import ActingRecord, Sensed, encode_floats
+from holdfast.planning.outcome import DONE_VALUES, Decisions, MoveResult, TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
@@ -179,13 +173,13 @@ class TestOneTrial:
         result = one(configuration_of(tmp_path))
         assert result.decisions is not None
         decisions = list(result.decisions)
-        task = [item for item in decisions if isinstance(item, TaskDecision)]
-        sensing = [item for item in decisions if isinstance(item, SensingDecision)]
+        task = [item for item in decisions if isinstance(item, ActingRecord)]
+        sensing = [item for item in decisions if isinstance(item, Sensed)]
         assert [item.step for item in task] == list(range(result.steps))
         assert [item.step for item in sensing] == list(range(0, result.steps, 9))
         assert len(sensing) == result.sensing_decisions == len(result.sensing_ms)
         # At a step of both kinds, the robot senses first.
-        steps = [(item.step, isinstance(item, TaskDecision)) for item in decisions]
+        steps = [(item.step, isinstance(item, ActingRecord)) for item in decisions]
         assert steps == sorted(steps)
 
     def test_decisions_hold_what_the_environment_was_told(self, tmp_path: Path) -> None:
@@ -193,14 +187,14 @@ class TestOneTrial:
 
         class Noting(SimulatedEnvironment):
             sensed: list[int]
-            performed: list[tuple[float, ...]]
+            performed: list[bytes]
 
             def perform_sensing(self, sensing_action: int) -> FloatArray:
                 self.sensed.append(sensing_action)
                 return super().perform_sensing(sensing_action)
 
             def perform(self, task_action: FloatArray) -> float | MoveResult | None:
-                self.performed.append(tuple(task_action.tolist()))
+                self.performed.append(encode_floats(task_action))
                 return super().perform(task_action)
 
         environment = Noting(configuration.problem, configuration.simulator.seed, 0)
@@ -215,10 +209,10 @@ class TestOneTrial:
         assert result.decisions is not None
         decisions = list(result.decisions)
         assert environment.sensed == [
-            item.sensing_action for item in decisions if isinstance(item, SensingDecision)
+            item.sensing_action for item in decisions if isinstance(item, Sensed)
         ]
         assert environment.performed == [
-            item.action for item in decisions if isinstance(item, TaskDecision)
+            item.action for item in decisions if isinstance(item, ActingRecord)
         ]
         assert result.digest == one(configuration).digest
 

@@ -151,9 +151,9 @@ def service_that_decided(error: DecidedOtherwiseError, timings: Path) -> str | N
         # Of a decision that was requested again, the last row is the one that was used. An answer
         # has the task actions up to the next sensing step.
         decided = {
-            row.step: row.service
-            for row in read_timings(timings)
-            if row.trial == error.trial and row.kind == error.kind and row.step <= error.step
+            step: service
+            for (trial, step, kind, service, *_), *_ in read_timings(timings)
+            if trial == error.trial and kind == error.kind and step <= error.step
         }
     service = decided[max(decided)] if decided else None
     return None if service == OWN_PLANNER else service

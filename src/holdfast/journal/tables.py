@@ -17,7 +17,7 @@ import numpy as np
 from holdfast.journal.fingerprint import EarlierCode
 from holdfast.journal.timings import AnswerCounts, VerificationCounts
 from holdfast.numerics.floating_mode import in_own_mode
-from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
+from holdfast.planning.outcome import COUNTS, TRIAL_COLUMNS, TrialResult
 from holdfast.printable import csv_rows
 
 _NORMAL_QUANTILE_975 = 1.959963984540054
@@ -111,22 +111,11 @@ def _mean(total: float | None, count: int) -> float | None:
     return None if total is None or not count else total / count
 
 
-_COUNTS = (
-    "sensing_decisions",
-    "missing_observations",
-    "unexplained_observations",
-    "lost",
-    "suspect_sensors",
-    "recoveries",
-)
-"""What the summary has the sum of, under the name that a trial's result has it."""
-
-
 class SummaryBuilder:
     """Adds up results, in the order of their trials."""
 
     def __init__(self) -> None:
-        self._sums = dict.fromkeys((*_COUNTS, "success", "failed", "steps"), 0)
+        self._sums = dict.fromkeys((*COUNTS, "success", "failed", "steps"), 0)
         self._finished = 0
         # Of all trials, and of the successful ones; None as soon as one has none.
         self._rewards: dict[bool, float | None] = {False: 0.0, True: 0.0}
@@ -165,7 +154,7 @@ class SummaryBuilder:
         """Return the summary."""
         count, sums = self._finished, self._sums
         successes = sums["success"]
-        counts: dict[str, Any] = {name: sums[name] for name in _COUNTS}
+        counts: dict[str, Any] = {name: sums[name] for name in COUNTS}
         median = p99 = None
         if self._sensing_ms:
             quantiles = np.quantile(np.frombuffer(self._sensing_ms, dtype=np.float32), [0.5, 0.99])

@@ -154,13 +154,14 @@ def count_answers(path: Path, trials: Container[int]) -> AnswerCounts | None:
 
     try:
         for row in read_timings(path):
-            if row.trial not in trials:
+            trial, step, kind, service, _, waited_ms, *_ = row.timing
+            if trial not in trials:
                 continue
-            if row.trial != current:
+            if trial != current:
                 count()
-                current = row.trial
-            decided[row.step, row.kind] = row.service
-            longest_ms = row.waited_ms if longest_ms is None else max(longest_ms, row.waited_ms)
+                current = trial
+            decided[step, kind] = service
+            longest_ms = waited_ms if longest_ms is None else max(longest_ms, waited_ms)
     except (OSError, csv.Error):
         return None
     count()
@@ -169,16 +170,9 @@ def count_answers(path: Path, trials: Container[int]) -> AnswerCounts | None:
 
 
 class TimingRow(NamedTuple):
-    """A row of ``timings.csv``; one that is cut short has no times but the first."""
+    """A row of ``timings.csv``, and when it was written; one that is cut short does not say."""
 
-    trial: int
-    step: int
-    kind: str
-    service: str
-    status: str
-    waited_ms: float
-    round_trip_ms: float = math.nan
-    computed_ms: float = math.nan
+    timing: Timing
     time_ns: int = 0
     stamp: Stamp | None = None
 
@@ -193,7 +187,8 @@ def rows_by_trial(path: Path) -> dict[int, dict[tuple[int, str], TimingRow]]:
     try:
         for row in read_timings(path):
             if row.time_ns > 0:
-                rows.setdefault(row.trial, {})[row.step, row.kind] = row
+                trial, step, kind, *_ = row.timing
+                rows.setdefault(trial, {})[step, kind] = row
     except FileNotFoundError:
         return {}
     except (OSError, csv.Error) as error:
@@ -210,16 +205,17 @@ def timings_of(lines: Iterable[str]) -> Iterator[TimingRow]:
     """Yield what lines of ``timings.csv`` say."""
     for trial, step, kind, service, status, waited_ms, *rest in _rows(lines, 6):
         try:
-            row = TimingRow(int(trial), int(step), kind, service, status, float(waited_ms))
+            place = int(trial), int(step), kind
+            timing = Timing(*place, service, status, float(waited_ms), math.nan, math.nan)
         except ValueError:
             continue
+        row = TimingRow(timing)
         with contextlib.suppress(ValueError):
             round_trip_ms, computed_ms, moment, *uptime = rest
-            row = row._replace(
-                round_trip_ms=float(round_trip_ms),
-                computed_ms=float(computed_ms),
-                time_ns=nanoseconds(moment),
-                stamp=Stamp.of(*uptime) if len(uptime) == 2 else None,
+            row = TimingRow(
+                timing._replace(round_trip_ms=float(round_trip_ms), computed_ms=float(computed_ms)),
+                nanoseconds(moment),
+                Stamp.of(*uptime) if len(uptime) == 2 else None,
             )
         yield row
 

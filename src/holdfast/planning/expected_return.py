@@ -36,7 +36,7 @@ them lead to the same actions, and a return is the sum of a hundred noisy steps.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -211,13 +211,12 @@ def _rollouts_of(
     )
     if has_own_rollouts(problem):
         threads = settings.active_sensing.num_cores
-        return lambda *begun_and_motion: checked.rollout_returns(
-            problem, *begun_and_motion, own, threads
-        )
+        return lambda *begun: checked.rollout_returns(problem, *begun, own, threads)
 
-    def roll_out(*begun_and_motion: Any) -> FloatArray:
-        *begun, motion = begun_and_motion
-        rollouts = _Rollouts(problem, own, *begun)
+    def roll_out(
+        truths: FloatArray, estimates: FloatArray, clouds: FloatArray, stage: int, motion: Stream
+    ) -> FloatArray:
+        rollouts = _Rollouts(problem, own, truths, estimates, clouds, stage)
         for step in range(own.steps):
             interruption.check()
             later, between = divmod(step, own.interval)

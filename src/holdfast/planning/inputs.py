@@ -17,11 +17,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from holdfast.errors import MessageError, RecordError
+from holdfast.errors import MessageError
 from holdfast.numerics import reproducible as numerics
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import ObservationInfo
-from holdfast.planning.outcome import SensingDecision, TaskDecision
 from holdfast.planning.planner import Planner, PlanningState
 
 MAX_INPUTS = 64
@@ -33,7 +32,8 @@ class Sensed(msgspec.Struct, array_like=True, frozen=True, tag=1):
 
     step: int
     sensing_action: int
-    observation: bytes  # empty if it comes later, or never, or if the choice was not to sense
+    # Empty if it comes later, or never, if the choice was not to sense, and in a :data:`Decision`.
+    observation: bytes
     digest: bytes = b""  # 32 bytes, of the state that it led to; empty before it is folded in
     sensing_ms: float = 0.0  # how long the sensing action was computed; for the tables only
 
@@ -101,21 +101,8 @@ Input: TypeAlias = CatchUpInput | Late | Reinitialised
 
 Record: TypeAlias = Input | ActingRecord | PausedRecord | LocalTookOverRecord
 
-_ENCODER = msgspec.msgpack.Encoder()
-_DECODER: msgspec.msgpack.Decoder[Record] = msgspec.msgpack.Decoder(Record)
-
-
-def encode_record(record: Record) -> bytes:
-    """Encode a record."""
-    return _ENCODER.encode(record)
-
-
-def decode_record(data: bytes) -> Record:
-    """Decode a record; raise RecordError if the bytes are not a record."""
-    try:
-        return _DECODER.decode(data)
-    except Exception as error:  # decoding may raise anything
-        raise RecordError(f"{len(data)} bytes are no record of a journal: {error}") from error
+Decision: TypeAlias = Sensed | ActingRecord
+"""What was decided, without what it has shown."""
 
 
 def fold(
@@ -145,13 +132,13 @@ def has_shown(record: Record) -> bool:
     return isinstance(record, Late)
 
 
-def decisions_of(records: Iterable[Record]) -> Iterator[SensingDecision | TaskDecision]:
+def decisions_of(records: Iterable[Record]) -> Iterator[Decision]:
     """Yield the decisions among records."""
     for record in records:
         if isinstance(record, Sensed):
-            yield SensingDecision(record.step, record.sensing_action, record.digest)
+            yield Sensed(record.step, record.sensing_action, b"", record.digest)
         elif isinstance(record, ActingRecord):
-            yield TaskDecision(record.step, tuple(decode_floats(record.action, None).tolist()))
+            yield record
 
 
 def numbers_of(data: bytes) -> FloatArray | None:

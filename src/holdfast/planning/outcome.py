@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from holdfast.errors import InvalidValueError
 from holdfast.numerics.arrays import FloatArray
+from holdfast.planning.inputs import ActingRecord, Decision, Sensed
 from holdfast.printable import one_line
 from holdfast.problems.attributes import sensing_costs
 
@@ -98,25 +99,11 @@ _OTHERS = {b"M": _END, b"L": _LATE, b"R": _END, b"E": _END}
 """Records that are no decision, but lead to the states in which later ones are taken."""
 
 
-class SensingDecision(NamedTuple):
-    """A sensing action that was chosen, and the digest of the state that its observation led to."""
-
-    step: int
-    sensing_action: int
-    state_digest: bytes
-
-
-class TaskDecision(NamedTuple):
-    """A task action as it was performed."""
-
-    step: int
-    action: tuple[float, ...]
-
-
 class Decisions(msgspec.Struct, frozen=True):
     """All decisions of a trial in order, in a few bytes each.
 
-    Iterating yields :class:`SensingDecision` and :class:`TaskDecision`.
+    Iterating yields them as records of a journal, :class:`~holdfast.planning.inputs.Sensed`
+    (without an observation) and :class:`~holdfast.planning.inputs.ActingRecord`.
 
     Attributes
     ----------
@@ -152,15 +139,15 @@ class Decisions(msgspec.Struct, frozen=True):
             inputs += kind in (b"S", b"M", b"L", b"R")
         return frozenset(found)
 
-    def __iter__(self) -> Iterator[SensingDecision | TaskDecision]:
+    def __iter__(self) -> Iterator[Decision]:
         for kind, position in self._records():
             if kind == b"S":
                 _, step, sensing_action, state_digest = _SENSING.unpack_from(self.log, position)
-                yield SensingDecision(step, sensing_action, state_digest)
+                yield Sensed(step, sensing_action, b"", state_digest)
             elif kind == b"A":
                 _, step = _TASK.unpack_from(self.log, position)
                 at = position + _TASK.size
-                yield TaskDecision(step, struct.unpack_from(f"<{self.action_size}d", self.log, at))
+                yield ActingRecord(step, self.log[at : at + 8 * self.action_size])
 
     def _records(self) -> Iterator[tuple[bytes, int]]:
         """Yield the kind of each record and where it begins; it lies in the log as a whole."""
@@ -316,6 +303,14 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
             return "succeeded"
         return "failed" if self.failed else "truncated"
 
+    def in_words(self) -> str:
+        """Return what the trial came to, on one line."""
+        text = (
+            f"{self.outcome} after {self.steps:,} steps, "
+            f"{self.sensing_decisions:,} sensing actions{self.reason and f': {self.reason}'}"
+        )
+        return text if self.reward is None else f"{text}; reward {self.reward:.6g}"
+
 
 TRIAL_COLUMNS = (
     *(
@@ -327,3 +322,13 @@ TRIAL_COLUMNS = (
     "reason",
 )
 """The columns of ``trials.csv``."""
+
+COUNTS = {
+    "sensing_decisions": "sensing actions",
+    "missing_observations": "missing observations",
+    "unexplained_observations": "observations that no particle explains",
+    "lost": "times that the robot was found lost",
+    "suspect_sensors": "sensors found suspect",
+    "recoveries": "times that the local service took over",
+}
+"""The columns that a summary adds up, in words."""

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import msgspec
-import numpy as np
 
 from holdfast.errors import InvalidValueError, MessageError, RecordError
 from holdfast.numerics.arrays import FloatArray
@@ -34,7 +33,7 @@ from holdfast.planning.inputs import (
     has_shown,
 )
 from holdfast.planning.lost import MOVE, LostTest, Verdict
-from holdfast.planning.outcome import DecisionLog, Ending, RewardAccount, TaskDecision, TrialResult
+from holdfast.planning.outcome import DecisionLog, Ending, RewardAccount, TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import LostSettings
 
@@ -101,7 +100,8 @@ class Trial:
     def actions(self) -> list[FloatArray]:
         """The task actions that were performed, in order."""
         decided = self.log.decisions()
-        return [np.array(each.action) for each in decided if isinstance(each, TaskDecision)]
+        acted = (each.action for each in decided if isinstance(each, ActingRecord))
+        return [decode_floats(action, None) for action in acted]
 
     def take(self, given: _GivenT) -> _GivenT:
         """Fold in a record; return it with the digest of the state that it leads to.

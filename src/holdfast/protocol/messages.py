@@ -322,9 +322,19 @@ def decode_request(payload: bytes) -> Request:
         raise _other_version(sent.version)
     if sent.checkpoint is not None and sent.inputs:
         raise MessageError("malformed", "a request has a checkpoint and inputs as well")
-    fields: list[Any] = list(msgspec.structs.astuple(sent)[:11])  # all but the settings' digest
-    fields[8:10] = tuple(map(_received, sent.inputs)), session_configuration
-    return Request(*fields)
+    return Request(
+        version=sent.version,
+        session=sent.session,
+        epoch=sent.epoch,
+        number=sent.number,
+        trial=sent.trial,
+        step=sent.step,
+        sensed=sent.sensed,
+        digest=sent.digest,
+        inputs=tuple(map(_received, sent.inputs)),
+        session_configuration=session_configuration,
+        checkpoint=sent.checkpoint,
+    )
 
 
 def _sent(given: CatchUpInput) -> _SentSensed | _SentMoved:

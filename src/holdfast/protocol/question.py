@@ -20,7 +20,10 @@ from holdfast.planning.planner import Planner, PlanningState, encode_checkpoint
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
+    PROTOCOL_VERSION,
+    Request,
     SensingAnswer,
+    SessionConfiguration,
     TaskAnswer,
 )
 from holdfast.protocol.robot_events import (
@@ -163,6 +166,30 @@ class Question:
         if self._checkpoint is None:
             self._checkpoint = encode_checkpoint(self.state)
         return self._checkpoint
+
+    def request(
+        self,
+        session: bytes,
+        epoch: int,
+        number: int,
+        num_inputs: int | None,  # the latest ones that it carries; None: the whole state
+        session_configuration: SessionConfiguration | None,
+    ) -> Request:
+        """Return the question as a service is asked it."""
+        state = self.state
+        return Request(
+            PROTOCOL_VERSION,
+            session,
+            epoch,
+            number,
+            state.trial,
+            state.step,
+            state.sensed,
+            self.digest,
+            self.inputs[-num_inputs:] if num_inputs else (),
+            session_configuration,
+            self.checkpoint() if num_inputs is None else None,
+        )
 
     def read_tasks(self, reply: TaskAnswer, action_size: int) -> list[FloatArray]:
         """Return the task actions of a reply.

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 
-from holdfast.planning.inputs import CatchUpInput
 from holdfast.protocol.failure_detector import FailureDetector
 from holdfast.protocol.question import Question
 
@@ -170,12 +169,10 @@ class Replica:
 
     # -- what it needs ---------------------------------------------------------------------------
 
-    def catch_up(
-        self, question: Question, *, whole_state: bool
-    ) -> tuple[tuple[CatchUpInput, ...], bytes | None]:
-        """Return what a request must carry for the service to reach the question's state.
+    def num_lacking(self, question: Question, *, whole_state: bool) -> int | None:
+        """Return how many of the latest inputs lead the service to the question's state.
 
-        The inputs since the state that it holds; or, where that is better, the whole state.
+        None if it must be sent the whole state, or where that is better.
         """
         state = question.state
         known = self.acknowledged
@@ -190,9 +187,7 @@ class Replica:
             )
         if self.num_diverged >= _MAX_DIVERGED or missing > len(question.inputs):
             whole_state = True
-        if whole_state:
-            return (), question.checkpoint()
-        return question.inputs[-missing:] if missing > 0 else (), None
+        return None if whole_state else max(0, missing)
 
 
 class ReplicaSet:

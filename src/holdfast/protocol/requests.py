@@ -17,13 +17,11 @@ from collections.abc import Iterator
 from holdfast.errors import MessageError, StaleEpochError
 from holdfast.planning.planner import Planner
 from holdfast.protocol.messages import (
-    PROTOCOL_VERSION,
     Busy,
     NeedState,
     Progress,
     Refused,
     Reply,
-    Request,
     SensingAnswer,
     SessionConfiguration,
     TaskAnswer,
@@ -199,24 +197,16 @@ class OpenRequests:
         open_calls = self.to(replica)
         for call in open_calls[: max(0, len(open_calls) - _MAX_CALLS + 1)]:
             self.abandon(call)
-        state = question.state
         opens = not replica.opened
-        inputs, checkpoint = replica.catch_up(question, whole_state=whole_state)
         self._number += 1
         call_number = self._number
         number = self._first_request + call_number
-        request = Request(
-            PROTOCOL_VERSION,
+        request = question.request(
             self._session,
             self._epoch,
             number,
-            state.trial,
-            state.step,
-            state.sensed,
-            question.digest,
-            inputs,
+            replica.num_lacking(question, whole_state=whole_state),
             self._session_configuration if opens else None,
-            checkpoint,
         )
         self._open[call_number] = OpenRequest(
             call_number,
@@ -225,13 +215,13 @@ class OpenRequests:
             question,
             now,
             opens=opens,
-            restores=checkpoint is not None,
+            restores=request.checkpoint is not None,
         )
         replica.detector.asked(now)
         payload = encode(request)
         if opens and not question.is_first:
             self._effects.report(
-                "restore", service=replica.name, step=state.step, bytes=len(payload)
+                "restore", service=replica.name, step=request.step, bytes=len(payload)
             )
         self._attempts = self._attempts + 1 if question is self._asked else 1
         self._asked = question
@@ -240,7 +230,7 @@ class OpenRequests:
             self._effects.report(
                 "retry",
                 service=replica.name,
-                step=state.step,
+                step=request.step,
                 attempt=self._attempts,
                 waited_ms=1e3 * waited_s,
             )

@@ -35,7 +35,7 @@ from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import LostSettings, SimulatorSettings
 from holdfast.planning.tracking import Trial
 from holdfast.protocol.messages import DIGEST_SIZE
-from holdfast.protocol.observation_reports import ObservationReports, held_error
+from holdfast.protocol.observation_warnings import ObservationWarnings, held_error
 from holdfast.protocol.question import DecisionSource, Provenance, Question
 from holdfast.protocol.robot_events import (
     Act,
@@ -79,7 +79,7 @@ class Robot:
         self._simulator = simulator
         self._source = source
         self._lost = LostSettings() if lost is None else lost
-        self.reports = ObservationReports(source.effects, self._lost)
+        self.reports = ObservationWarnings(source.effects, self._lost)
         self._period_s = None if rate_hz is None else 1.0 / rate_hz
         # One list for both, because the order of all effects counts.
         self._effects = source.effects

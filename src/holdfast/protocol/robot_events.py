@@ -194,7 +194,7 @@ class LogEvent(NamedTuple):
 
 
 class Timing(NamedTuple):
-    """How long a decision took; for the tables only."""
+    """Who made a decision, and how long it took; for the tables only."""
 
     trial: int
     step: int

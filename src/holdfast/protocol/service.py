@@ -34,12 +34,7 @@ from holdfast.planning.planner import needs_sensing
 from holdfast.problems.problem import Problem
 from holdfast.protocol.computing_time import ExpectedTime
 from holdfast.protocol.decision_cost import ANY_MACHINE, Cost, Pricing
-from holdfast.protocol.messages import (
-    MAX_WORD,
-    Request,
-    SessionConfiguration,
-    pack_configuration,
-)
+from holdfast.protocol.messages import MAX_WORD, Request, SessionConfiguration, pack_configuration
 from holdfast.protocol.robot_events import Effects
 from holdfast.protocol.service_jobs import (
     Computed,
@@ -402,13 +397,12 @@ class Service:
             self._statistics.superseded += 1
             session.remove_task(waiting)
             self._queue[lane].replace(waiting, request, sensing=sensing, size=size)
-            task = waiting
+            session.pending[request.digest] = task = waiting
         else:
             task = PendingTask(
                 session, request.digest, sensing=sensing, since=now, request=request, size=size
             )
-            self._queue[lane].enqueue(task)
-        session.pending[task.digest] = task
+            self._queue.enqueue(task)
         self._calls.attach(task, call, request.number, now)
         return task
 
@@ -425,8 +419,7 @@ class Service:
         """Queue the sensing part of the state ahead."""
         digest, state = session.ahead_digest, session.ahead
         task = PendingTask(session, digest, sensing=True, since=now, state=state)
-        session.pending[digest] = task
-        self._queue[task.lane].enqueue(task)
+        self._queue.enqueue(task)
         return task
 
     def _start_job(self, task: PendingTask, now: float) -> None:

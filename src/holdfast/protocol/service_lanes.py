@@ -114,6 +114,11 @@ class Lanes:
         """Return the lane of which a worker has a job; None if it was forgotten."""
         return next((lane for lane in self._lanes if lane.runs(job)), None)
 
+    def enqueue(self, task: PendingTask) -> None:
+        """Queue a task of its session in its lane."""
+        task.session.pending[task.digest] = task
+        self[task.lane].enqueue(task)
+
     def postpone(self, task: PendingTask, cost: Cost | None, now: float) -> bool:
         """Queue a task again in another lane, if a call waits for it; return whether there is room.
 
@@ -132,8 +137,7 @@ class Lanes:
             # It blocks nobody on a thread, and its next ones go there until one is short again.
             task.expected_time.typical_s = math.inf
             if task.calls:
-                session.pending[task.digest] = task
-                self[task.lane].enqueue(task)
+                self.enqueue(task)
             return True
         session.is_brief = False
         if cost is None:
@@ -145,8 +149,7 @@ class Lanes:
         task.move_to(MEDIUM if fits else LONG, cost)
         if task.slot == REQUESTED and self[task.lane].is_overloaded(now, session.owner):
             return False
-        session.pending[task.digest] = task
-        self[task.lane].enqueue(task)
+        self.enqueue(task)
         return True
 
     # -- what nobody awaits, or takes too long ---------------------------------------------------

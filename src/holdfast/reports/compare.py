@@ -14,15 +14,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import msgspec
 
 from holdfast.journal.fingerprint import read_earlier
 from holdfast.journal.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.journal.run_directory import configuration_difference, recorded_configuration
-from holdfast.planning.inputs import ActingRecord, decisions_of
-from holdfast.planning.outcome import Decisions, SensingDecision, TaskDecision
+from holdfast.planning.inputs import ActingRecord, Decision, Sensed, decisions_of
+from holdfast.planning.outcome import Decisions
 from holdfast.printable import one_line
 
 _ENDING = struct.Struct("<cQ32s")
@@ -187,7 +187,7 @@ def _state_of(number: int, finished: set[int], begun: UnfinishedTrial | None) ->
     if number in finished:
         return "finished"
     if begun is not None and begun.trial == number:
-        looked = sum(isinstance(each, SensingDecision) for each in decisions_of(begun.records))
+        looked = sum(isinstance(record, Sensed) for record in begun.records)
         acted = sum(isinstance(record, ActingRecord) for record in begun.records)
         return (
             f"unfinished, {_counted(looked, 'sensing action')} and "
@@ -205,7 +205,7 @@ def _compare_unfinished(
         found = _difference_of_decision(one, other, trial)
         if found is not None:
             return found
-        same["sensing_actions" if isinstance(one, SensingDecision) else "task_actions"] += 1
+        same["sensing_actions" if isinstance(one, Sensed) else "task_actions"] += 1
     return None
 
 
@@ -242,11 +242,8 @@ def _ending(decisions: Decisions) -> tuple[int, bytes]:
     return (steps, digest) if kind == b"E" else (0, b"")
 
 
-_Decision: TypeAlias = SensingDecision | TaskDecision
-
-
 def _difference_of_decision(
-    first: _Decision | None, second: _Decision | None, trial: int
+    first: Decision | None, second: Decision | None, trial: int
 ) -> Difference | None:
     """Return what differs first in two decisions, None if nothing does."""
     for (what, bits, text), (_, other_bits, other_text) in zip(
@@ -261,15 +258,15 @@ def _difference_of_decision(
     return None
 
 
-def _parts(decision: _Decision | None) -> Iterator[tuple[str, bytes, str]]:
+def _parts(decision: Decision | None) -> Iterator[tuple[str, bytes, str]]:
     """Yield what a decision consists of: its name, its bits, and the words for a person.
 
     By their bits, because 0.0 and -0.0 are different actions, and a NaN is equal to itself.
     """
     if decision is None:
         yield "next decision", b"", "none, the trial ends"
-    elif isinstance(decision, SensingDecision):
-        step, action, digest = decision
+    elif isinstance(decision, Sensed):
+        step, action, digest = decision.step, decision.sensing_action, decision.digest
         where = f"sensing action {action} at step {step}"
         yield "next decision", b"S" + step.to_bytes(8, "big"), where
         yield "sensing action", action.to_bytes(8, "big"), str(action)
@@ -277,7 +274,7 @@ def _parts(decision: _Decision | None) -> Iterator[tuple[str, bytes, str]]:
     else:
         where = f"a task action at step {decision.step}"
         yield "next decision", b"A" + decision.step.to_bytes(8, "big"), where
-        for index, value in enumerate(decision.action):
+        for index, (value,) in enumerate(struct.iter_unpack("<d", decision.action)):
             yield f"task action[{index}]", struct.pack(">d", value), repr(value)
 
 

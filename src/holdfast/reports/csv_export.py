@@ -23,14 +23,16 @@ from holdfast.printable import cell, cells
 from holdfast.problems.attributes import choice_labels
 from holdfast.problems.attributes import state_labels as declared_labels
 from holdfast.problems.problem import Problem
+from holdfast.protocol.robot_events import Timing
 from holdfast.reports.facts import (
-    Decider,
+    DECIDER,
     EventFact,
     LateFact,
     SensingFact,
     TaskFact,
     TrialBeginFact,
     TrialEndFact,
+    shown_decider,
 )
 
 TABLES = ("trials.csv", "steps.csv", "beliefs.csv", "events.csv")
@@ -73,7 +75,7 @@ class CsvSink:
                 *(f"action_{index}" for index in range(problem.action_size)),
                 *("motion", "move_observation", "reward"),
                 *("sensing_time", "observation_time", "action_time"),
-                *(f"{kind}_{name}" for kind in ("sensing", "action") for name in Decider._fields),
+                *(f"{kind}_{name}" for kind in ("sensing", "action") for name in DECIDER),
             ],
             lineterminator="\n",
         )
@@ -204,10 +206,8 @@ def _cells(
     return {name.format(each): value for each, value in zip(names, values.tolist(), strict=True)}
 
 
-def _decider_cells(kind: str, decider: Decider | None) -> dict[str, Any]:
-    if decider is None:
-        return {}
-    return {f"{kind}_{name}": value for name, value in decider._asdict().items()}
+def _decider_cells(kind: str, decider: Timing | None) -> dict[str, Any]:
+    return {f"{kind}_{name}": value for name, value in shown_decider(decider).items()}
 
 
 def _seconds(time_ns: int) -> str:

@@ -7,6 +7,7 @@ tables, ROS messages or arrays. All times are on one clock.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isnan
 from typing import Any, NamedTuple, Protocol
 
 from holdfast.journal.run_clock import Stamp
@@ -14,6 +15,7 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
 from holdfast.planning.inputs import numbers_of
 from holdfast.planning.outcome import TrialResult
+from holdfast.protocol.robot_events import Timing
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep
 
 SCORES = {
@@ -25,21 +27,19 @@ SCORES = {
 }
 """What a fact's entropies are, by the method that weighs them, in two lines."""
 
+DECIDER = ("service", "status", "waited_ms", "round_trip_ms", "computed_ms")
+"""What of the timing of a decision, the fact's ``decider``, stands beside it."""
 
-class Decider(NamedTuple):
-    """Who made a decision, and how long it took; from ``timings.csv``."""
 
-    service: str
-    status: str
-    waited_ms: float  # how long the robot stood still for it
-    # None for an action that came in the answer to an earlier request.
-    round_trip_ms: float | None
-    computed_ms: float | None
+def shown_decider(decider: Timing | None) -> dict[str, Any]:
+    """Return what is known of :data:`DECIDER`.
 
-    @classmethod
-    def of(cls, answer: Any) -> Decider:
-        """Return that of a ``Timing``, or of a row of the table."""
-        return cls(*(getattr(answer, name) for name in cls._fields))
+    Of an action that came in the answer to an earlier request there are no times but the wait.
+    """
+    if decider is None:
+        return {}
+    known = {name: getattr(decider, name) for name in DECIDER}
+    return {name: each for name, each in known.items() if isinstance(each, str) or not isnan(each)}
 
 
 class TrialBeginFact(NamedTuple):
@@ -56,7 +56,7 @@ class SensingFact(NamedTuple):
     # When it was chosen, and when its observation was part of the belief.
     decided_ns: int
     observed_ns: int
-    decider: Decider | None
+    decider: Timing | None
 
 
 class TaskFact(NamedTuple):
@@ -64,7 +64,7 @@ class TaskFact(NamedTuple):
 
     step: TaskStep
     time_ns: int
-    decider: Decider | None
+    decider: Timing | None
     true_state: FloatArray | None = None  # before the action
 
     @property

@@ -32,7 +32,6 @@ from holdfast.config.loader import Configuration
 from holdfast.numerics import reproducible as numerics
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.floating_mode import in_own_mode
-from holdfast.planning.outcome import Outcome
 from holdfast.problems import checked
 from holdfast.problems.attributes import choice_labels, circular_states
 from holdfast.problems.problem import Problem, Scene
@@ -55,12 +54,6 @@ _ESTIMATED: Any = {"color": _BELIEF, "linestyle": (0, (4, 1.5))}
 # Ordered so that neighbours differ in lightness, too.
 _ACTION_COLORS = ("#1D3C78", "#E8A317", "#B5342B", "#54B5A6", "#7D3C98", "#9AA05A")
 _ACTION_MARKERS = ("o", "s", "^", "D", "v", "P")
-
-_OUTCOMES: dict[Outcome, str] = {
-    "succeeded": "goal reached",
-    "failed": "failed",
-    "truncated": "goal not reached",
-}
 
 _NUM_BODIES = 9
 _NUM_CLOUDS = 4
@@ -156,13 +149,7 @@ def _title(configuration: Configuration, record: TrialRecord) -> str:
     text = f"{configuration.problem_name}, seed {configuration.simulator.seed}"
     result = record.result
     if result is not None:
-        outcome = _OUTCOMES[result.outcome]
-        text += (
-            f", trial {result.trial}: {outcome} in {result.steps:,} steps, "
-            f"{result.sensing_decisions:,} sensing actions"
-        )
-        if result.reward is not None:
-            text += f", reward {result.reward:.4g}"
+        text += f", trial {result.trial} {result.in_words()}"
         shown = len(record.actions)
         if shown < result.steps:
             text += f" (the first {shown:,} steps)"

@@ -20,7 +20,7 @@ from holdfast.journal.fingerprint import read_earlier
 from holdfast.journal.journal_reader import JournalReader
 from holdfast.journal.run_directory import TIMINGS_NAME, VERIFICATION_NAME
 from holdfast.journal.timings import TimingRow, count_answers, count_verified
-from holdfast.planning.outcome import TrialResult
+from holdfast.planning.outcome import COUNTS, TrialResult
 from holdfast.printable import one_line
 from holdfast.reports.facts import EventFact
 from holdfast.reports.html_page import HtmlPage, chart_part
@@ -51,14 +51,6 @@ _SHOWN = ("candidates.csv", "table.csv", "trials.csv")  # as charts, or too long
 _ROWS = 30
 _MOST = 10**9  # a number of a trial or step; a damaged table may have any
 
-_COUNTS = {
-    "sensing_decisions": "sensing actions",
-    "missing_observations": "missing observations",
-    "unexplained_observations": "observations that no particle explains",
-    "lost": "times that the robot was found lost",
-    "suspect_sensors": "sensors found suspect",
-    "recoveries": "times that the local service took over",
-}
 _ZOOM = "Drag to move, Ctrl and the wheel (or a pinch) to zoom, a double click to go back."
 
 
@@ -112,8 +104,8 @@ def run_page(
         page.paragraph(f"The run is not finished{begun}.")
     page.section("Outcome")
     _add_estimates(page, results, outcomes.step_limit)
-    sums = {name: sum(getattr(each, name) for each in results) for name in _COUNTS}
-    page.table([], [(words, f"{sums[name]:,}") for name, words in _COUNTS.items() if sums[name]])
+    sums = {name: sum(getattr(each, name) for each in results) for name in COUNTS}
+    page.table([], [(words, f"{sums[name]:,}") for name, words in COUNTS.items() if sums[name]])
     _add_trials(page, results)
     page.section("Who decided")
     times = read_times(directory)
@@ -179,7 +171,7 @@ def _add_timeline(
     page: HtmlPage, decisions: Sequence[TimingRow], events: Sequence[EventFact]
 ) -> None:
     """Add waits and events over time, and a table of the longest waits."""
-    longest = sorted(decisions, key=lambda row: -row.waited_ms)[: _DECISIONS // 4]
+    longest = sorted(decisions, key=lambda row: -row.timing.waited_ms)[: _DECISIONS // 4]
     shown = {id(row): row for row in [*longest, *_thinned(decisions, _DECISIONS)]}
     happened = [each for each in events if each.name != "trial"]
     bad = [each for each in happened if severity(each.name, each.fields) != "INFO"]
@@ -192,15 +184,15 @@ def _add_timeline(
 
     points = [
         {
-            "t": seconds(row.time_ns),
-            "waited": round(row.waited_ms, 3),
-            "service": one_line(row.service)[:40],
-            "status": one_line(row.status)[:40],
-            "trial": min(row.trial, _MOST),
-            "step": min(row.step, _MOST),
-            "kind": one_line(row.kind)[:40],
+            "t": seconds(time_ns),
+            "waited": round(each.waited_ms, 3),
+            "service": one_line(each.service)[:40],
+            "status": one_line(each.status)[:40],
+            "trial": min(each.trial, _MOST),
+            "step": min(each.step, _MOST),
+            "kind": one_line(each.kind)[:40],
         }
-        for row in shown.values()
+        for each, time_ns, _ in shown.values()
     ]
     ticks = [
         {
@@ -226,8 +218,8 @@ def _add_timeline(
     page.table(
         head,
         [
-            (f"{each.waited_ms:.1f}", seconds(each.time_ns), *each[:5])
-            for each in longest[:8]
+            (f"{each.waited_ms:.1f}", seconds(time_ns), *each[:5])
+            for each, time_ns, _ in longest[:8]
             if each.waited_ms > 0.0
         ],
     )
@@ -248,7 +240,7 @@ def _add_worst(
     try:
         with RecordedRun(run, "report", problem_directory=problem_directory) as recorded:
             for number, result in enumerate(worst, start=1):
-                page.heading(_title(result))
+                page.heading(f"Trial {result.trial} {result.in_words()}")
                 most = max(20, _STEPS // len(worst))
                 settings, why = recorded.configuration, ""
                 try:
@@ -271,14 +263,6 @@ def _add_worst(
             [(each.trial, each.outcome, each.steps, each.reward) for each in worst],
         )
     return notes
-
-
-def _title(result: TrialResult) -> str:
-    reward = "" if result.reward is None else f", reward {result.reward:.4g}"
-    return (
-        f"Trial {result.trial}: {result.outcome} after {result.steps:,} steps, "
-        f"{result.sensing_decisions:,} sensing actions{reward}"
-    )
 
 
 def _add_trial(page: HtmlPage, chart: TrialChart, configuration: Configuration) -> None:

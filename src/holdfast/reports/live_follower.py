@@ -23,18 +23,12 @@ from holdfast.journal.journal_reader import JournalReader, decode_records, decod
 from holdfast.journal.run_directory import EVENTS_NAME, TIMINGS_NAME
 from holdfast.journal.timings import TimingRow, timings_of
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning.inputs import (
-    ActingRecord,
-    Late,
-    Moved,
-    Record,
-    Sensed,
-)
+from holdfast.planning.inputs import ActingRecord, Late, Moved, Record, Sensed
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.tracking import Trial
+from holdfast.protocol.robot_events import Timing
 from holdfast.reports.facts import (
-    Decider,
     FactSink,
     LateFact,
     SensingFact,
@@ -82,13 +76,13 @@ class Follower:
         self._clock = clock
         self._trial: Trial | None = None
         self._simulated: SimulatedEnvironment | None = None
-        self._deciders: dict[tuple[int, int, str], tuple[int, Decider]] = {}
-        self._answered: Decider | None = None
+        self._decided: dict[tuple[int, int, str], TimingRow] = {}
+        self._answered: Timing | None = None
         self.steps = self.left_out = 0
 
     def timing(self, row: TimingRow) -> None:
         """Take who decided, before the record of that decision."""
-        self._deciders[row.trial, row.step, row.kind] = row.time_ns, Decider.of(row)
+        self._decided[row.timing[:3]] = row
 
     def records(self, number: int, records: list[Record], time_ns: int) -> None:
         """Take what was journalled of a trial, in order and from its beginning on."""
@@ -133,9 +127,7 @@ class Follower:
             )
         )
         self._trial = self._simulated = None
-        self._deciders = {
-            key: each for key, each in self._deciders.items() if key[0] != state.trial
-        }
+        self._decided = {at: row for at, row in self._decided.items() if at[0] != state.trial}
 
     @property
     def _true_state(self) -> FloatArray | None:
@@ -148,12 +140,11 @@ class Follower:
             why = self._planner.choose_sensing_action(before)[1]
         record = trial.take(record)
         if isinstance(record, Sensed):
-            decided_ns, decider = self._deciders.pop(
-                (before.trial, before.step, "sensing"), (time_ns, None)
-            )
+            row = self._decided.pop((before.trial, before.step, "sensing"), None)
             if why is not None:
                 assert trial.found is not None
                 step = SensingStep(before, record, why, trial.state, trial.found)
+                decider, decided_ns = (None, time_ns) if row is None else row[:2]
                 self._sink.sensed(SensingFact(step, decided_ns, time_ns, decider))
         elif isinstance(record, ActingRecord):
             self.steps += 1
@@ -172,10 +163,10 @@ class Follower:
 
     def _acting(self, state: PlanningState, action: FloatArray, time_ns: int) -> None:
         """Show an action when it is ordered: how it went shows at the next one."""
-        asked = self._deciders.pop((state.trial, state.step, "task"), None)
-        if asked is not None:
+        row = self._decided.pop((state.trial, state.step, "task"), None)
+        if row is not None:
             # An answer has the task actions up to the next sensing step.
-            self._answered = asked[1]
+            self._answered = row.timing
         info = self._planner.choose_task_action(state)[1]
         step = TaskStep(
             cast("Environment", self._simulated), state, info, action, Moved(state.step, None)

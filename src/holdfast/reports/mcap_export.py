@@ -23,16 +23,17 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
 from holdfast.planning.planner import PlanningState
 from holdfast.problems.attributes import choice_labels
+from holdfast.protocol.robot_events import Timing
 from holdfast.protocol.status import Status
 from holdfast.reports.csv_export import state_labels
 from holdfast.reports.facts import (
-    Decider,
     EventFact,
     LateFact,
     SensingFact,
     TaskFact,
     TrialBeginFact,
     TrialEndFact,
+    shown_decider,
 )
 from holdfast.reports.markers import GrowingPath, Marker, scene_markers, sensing_markers
 from holdfast.reports.poses import pose_layout
@@ -198,13 +199,10 @@ class McapSink:
         if result is None:
             self._log(now, "INFO", f"trial {fact.trial}: {fact.steps} steps so far; not finished")
             return
-        text = f"trial {fact.trial} {result.outcome} after {result.steps} steps"
-        if result.reason:
-            text += f" ({result.reason})"
-        if result.reward is not None:
-            text += f", reward {result.reward:.6g}"
         level = "INFO" if result.outcome == "succeeded" else "WARN"
-        self._log(now, level, f"{text}; decisions {result.digest[:16]}")
+        self._log(
+            now, level, f"trial {fact.trial} {result.in_words()}; decisions {result.digest[:16]}"
+        )
 
     def happened(self, fact: EventFact) -> None:
         """Write an event of the services."""
@@ -326,13 +324,12 @@ class McapSink:
         now: int,
         state: PlanningState,
         kind: str,
-        decider: Decider | None,
+        decider: Timing | None,
         facts: Mapping[str, Any],
     ) -> None:
         status = "decided" if decider is None else decider.status
         entries: dict[str, Any] = {"trial": state.trial, "step": state.step, **facts}
-        if decider is not None:
-            entries |= decider._asdict()
+        entries |= shown_decider(decider)
         level, message = 0, status
         if decider is not None and decider.status == Status.LOCAL_RECOVERY.value:
             level = 1

@@ -20,22 +20,18 @@ from pathlib import Path
 from typing import Self
 
 from holdfast.config.loader import Configuration
-from holdfast.errors import (
-    DecidedOtherwiseError,
-    HoldfastError,
-    OutputError,
-    UntrustedCodeError,
-)
+from holdfast.errors import DecidedOtherwiseError, HoldfastError, OutputError, UntrustedCodeError
 from holdfast.journal.fingerprint import difference, fingerprint
 from holdfast.journal.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.journal.run_directory import recorded_configuration
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.floating_mode import in_own_mode
-from holdfast.planning.outcome import TaskDecision, TrialResult
+from holdfast.planning.inputs import ActingRecord
+from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.printable import one_line
+from holdfast.protocol.robot_events import Timing
 from holdfast.reports.facts import (
-    Decider,
     EventFact,
     FactSink,
     LateFact,
@@ -45,12 +41,7 @@ from holdfast.reports.facts import (
     TrialEndFact,
 )
 from holdfast.reports.recorder import true_state
-from holdfast.reports.step_times import (
-    StepClock,
-    TrialTimes,
-    read_times,
-    trial_ends,
-)
+from holdfast.reports.step_times import StepClock, TrialTimes, read_times, trial_ends
 from holdfast.robot.environment import Environment
 from holdfast.robot.recomputing import ComparedTrial, RecordedTrials
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep
@@ -163,16 +154,18 @@ class RecordedRun:
         return recorded.trial
 
     def _times(self, facts: _Facts, clock: StepClock) -> TrialTimes:
-        trial, steps = facts.trial, sum(isinstance(each, TaskDecision) for each in facts.expected)
+        trial, steps = facts.trial, sum(isinstance(each, ActingRecord) for each in facts.expected)
         rows = self._rows.get(trial, {}) if self.has_times else {}
         times = clock.next_trial(steps, rows, self._ends.get(trial))
-        deciders = {key: Decider.of(row) for key, row in rows.items()}
-        current: Decider | None = None
+        deciders = {key: row.timing for key, row in rows.items()}
+        current: Timing | None = None
         for step in range(steps):
             asked = deciders.get((step, "task"))
             if asked is not None:
                 # An answer has the task actions up to the next sensing step.
-                current = Decider(asked.service, asked.status, 0.0, None, None)
+                current = asked._replace(
+                    waited_ms=0.0, round_trip_ms=math.nan, computed_ms=math.nan
+                )
             elif (step, "sensing") in deciders:
                 current = None
             elif current is not None:

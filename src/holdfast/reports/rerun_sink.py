@@ -27,10 +27,10 @@ from holdfast.numerics.randomness import NoiseFreeStream
 from holdfast.planning.belief import Belief, standard_deviation
 from holdfast.problems import checked
 from holdfast.problems.attributes import choice_labels, circular_states
+from holdfast.protocol.robot_events import Timing
 from holdfast.protocol.status import Status
 from holdfast.reports.csv_export import state_labels
 from holdfast.reports.facts import (
-    Decider,
     EventFact,
     LateFact,
     SensingFact,
@@ -193,11 +193,8 @@ class RerunSink:
         if result is None:
             self._text("INFO", f"trial {fact.trial}: {fact.steps} steps so far; not finished")
             return
-        text = f"trial {fact.trial} {result.outcome} after {result.steps} steps"
-        text += f": {result.reason}" if result.reason else ""
-        if result.reward is not None:
-            text += f"; reward {result.reward:.6g}"
         self._state("trial", result.outcome)
+        text = f"trial {fact.trial} {result.in_words()}"
         self._text("INFO" if result.outcome == "succeeded" else "WARN", text)
         # The next trial's first step comes after this one's last belief.
         self._last += 1
@@ -313,7 +310,7 @@ class RerunSink:
         for marker in sensing_markers(self._problem, self._layout, _TASK, belief, sensing_action):
             self._recording.log(f"{entity}/{marker.namespace}", _shape(marker, _SENSED))
 
-    def _decider(self, decider: Decider | None) -> None:
+    def _decider(self, decider: Timing | None) -> None:
         if decider is None:
             return
         self._state("decider", decider.service)

@@ -18,7 +18,8 @@ from holdfast.journal.run_clock import RunClock, Stamp
 from holdfast.journal.run_directory import EVENTS_NAME, TIMINGS_NAME
 from holdfast.journal.timings import TimingRow, nanoseconds, rows_by_trial
 from holdfast.numerics.arrays import IntArray
-from holdfast.reports.facts import Decider, EventFact
+from holdfast.protocol.robot_events import Timing
+from holdfast.reports.facts import EventFact
 from holdfast.runtime.files import bounded_lines
 
 NS_PER_S = 1_000_000_000
@@ -40,7 +41,7 @@ class TrialTimes(NamedTuple):
     """When the moments of a trial were, and who decided, by step and kind."""
 
     times_ns: IntArray
-    deciders: Mapping[tuple[int, str], Decider]
+    deciders: Mapping[tuple[int, str], Timing]
 
     def at(self, step: int, moment: int) -> int:
         """Return the time of a moment of a step, in nanoseconds."""

@@ -21,10 +21,10 @@ from holdfast.printable import one_line
 from holdfast.problems import checked
 from holdfast.problems.attributes import choice_labels, circular_states
 from holdfast.problems.problem import Scene
+from holdfast.protocol.robot_events import Timing
 from holdfast.reports.csv_export import state_labels
 from holdfast.reports.facts import (
     SCORES,
-    Decider,
     EventFact,
     LateFact,
     SensingFact,
@@ -33,12 +33,7 @@ from holdfast.reports.facts import (
     TrialEndFact,
 )
 from holdfast.reports.html_page import Chart, chart_part
-from holdfast.reports.scene_drawing import (
-    body_corners,
-    obstacles_within,
-    shown_part,
-    walls_at,
-)
+from holdfast.reports.scene_drawing import body_corners, obstacles_within, shown_part, walls_at
 
 MAX_PARTICLES = 80
 """Particles that are kept of a belief: evenly spread ones, if it has more."""
@@ -70,7 +65,7 @@ class TrialChart:
         plane = (0, min(1, size - 1)) if scene is None else scene.axes
         self._planes = [plane, *([] if scene is None else scene.targets)]
         self._every = -(-max(result.steps, 1) // most)
-        self._every_sensing = -(-max(result.sensing_decisions, 1) // most)
+        self._every_sensing = -(-max(len(result.sensing_ms), 1) // most)
         self.left_out = self._every > 1
         self._rows: list[dict[str, Any]] = []
         self._beliefs: list[dict[str, Any]] = []
@@ -115,7 +110,7 @@ class TrialChart:
         belief: Belief,
         estimate: FloatArray,
         truth: FloatArray | None,
-        decider: Decider | None,
+        decider: Timing | None,
         *,
         last: bool = False,
     ) -> None:
@@ -312,7 +307,7 @@ def _short(text: object) -> str:
     return line if len(line) <= _MAX_TEXT else f"{line[: _MAX_TEXT - 1]}…"
 
 
-def _by(decider: Decider | None) -> str:
+def _by(decider: Timing | None) -> str:
     if decider is None:
         return ""
     waited = f", waited {decider.waited_ms:.3g} ms" if decider.waited_ms > 0.0 else ""

@@ -16,14 +16,14 @@ import os
 import signal
 import sys
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from time import monotonic
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from holdfast.config.loader import Configuration
 from holdfast.config.user_code import account_of_user_error, describe_problem_error
 from holdfast.errors import DEFECT, HeldError, HoldfastError, TrialError, defect_fields
-from holdfast.planning.inputs import Record
+from holdfast.journal.journal import Journal
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import PlanningState
 from holdfast.planning.tracking import Trial, replay
@@ -77,33 +77,6 @@ _SWITCH_INTERVAL_S = 0.0005
 """Longest time that a thread holds the interpreter while another one waits for it."""
 
 
-class _TrialInProgress(Protocol):
-    """A trial that has not ended; complete if none of its records can be missing."""
-
-    @property
-    def trial(self) -> int: ...
-    @property
-    def records(self) -> Sequence[Record]: ...
-    @property
-    def is_complete(self) -> bool: ...
-
-
-class StepJournal(Protocol):
-    """What a robot needs of a journal: :class:`holdfast.journal.journal.Journal` has it."""
-
-    def session(self) -> bytes:
-        """Return the run's identifier, 16 bytes."""
-
-    def raise_epoch(self) -> int:
-        """Return a number above all earlier ones, once it is on the disk."""
-
-    def append(self, trial: int, records: Sequence[Record]) -> None:
-        """Write records of the unfinished trial; they are safe when this returns."""
-
-    def unfinished(self) -> _TrialInProgress | None:
-        """Return the trial that has not ended, if there is one."""
-
-
 class _Interrupted(NamedTuple):
     """A request to end in order, by a signal or by :meth:`RobotProcess.pause`."""
 
@@ -124,7 +97,7 @@ class RobotProcess:
         configuration: Configuration,
         # Their transport is closed at the end. Without one the robot's own planner decides.
         links: Links,
-        journal: StepJournal,
+        journal: Journal,
         maker: EnvironmentMaker,
         events: EventSink,
         # on_result, on_timing, on_verified: store the result of each trial, the times of each
@@ -521,7 +494,7 @@ class RobotProcess:
                 self._ended = not left
                 self._on_loop().call_later(_LAST_VERIFICATION_S, self._end)
                 return
-            trial, records, tail_is_certain = following, (), True
+            trial, records, tail_is_certain = following, [], True
         self._replayed = trial
         seed = self._configuration.simulator.seed
         rate = self._configuration.lost.false_alarm_rate

@@ -17,7 +17,6 @@ from time import perf_counter
 from typing import cast
 
 import msgspec
-import numpy as np
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import DecidedOtherwiseError, HoldfastError
@@ -27,6 +26,7 @@ from holdfast.journal.run_directory import RunDirectory
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.inputs import (
     ActingRecord,
+    Decision,
     Late,
     Moved,
     Record,
@@ -35,7 +35,7 @@ from holdfast.planning.inputs import (
     decisions_of,
     encode_floats,
 )
-from holdfast.planning.outcome import Ending, SensingDecision, TaskDecision, TrialResult
+from holdfast.planning.outcome import Ending, TrialResult
 from holdfast.planning.planner import Planner, PlanningState, TaskInfo, digest
 from holdfast.planning.tracking import Trial
 from holdfast.robot.environment import Environment, SimulatedEnvironment
@@ -178,11 +178,12 @@ class ComparedTrial(TrialObserver):
     ) -> None:
         self.trial = recorded.trial
         self.result = recorded if isinstance(recorded, TrialResult) else None
-        self.expected: list[SensingDecision | TaskDecision]
-        if isinstance(recorded, TrialResult):
-            self.expected = list(recorded.decisions or ())
-        else:
-            self.expected = list(decisions_of(recorded.records))
+        decided = (
+            recorded.decisions or ()
+            if isinstance(recorded, TrialResult)
+            else decisions_of(recorded.records)
+        )
+        self.expected = list(decided)
         self._compared = 0
         self._on_same = on_same
         self._observer = observer
@@ -194,14 +195,13 @@ class ComparedTrial(TrialObserver):
     @in_own_mode
     def sensed(self, step: SensingStep) -> None:
         """Compare a sensing action, and the state after its observation."""
-        self._require(SensingDecision(step.before.step, step.sensing_action, digest(step.after)))
+        self._require(Sensed(step.before.step, step.sensing_action, b"", digest(step.after)))
         self._observer.sensed(step)
 
     @in_own_mode
     def acted(self, step: TaskStep) -> None:
         """Compare a task action."""
-        action = np.array(step.executed, dtype=np.float64)
-        self._require(TaskDecision(step.state.step, tuple(action.tolist())))
+        self._require(ActingRecord(step.state.step, encode_floats(step.executed)))
         self._observer.acted(step)
 
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
@@ -215,19 +215,17 @@ class ComparedTrial(TrialObserver):
         if self._compared < len(self.expected):
             raise DecidedOtherwiseError(self.trial, self.expected[self._compared].step, None)
 
-    def _require(self, decision: SensingDecision | TaskDecision) -> None:
+    def _require(self, decision: Decision) -> None:
         at = self._compared
         kept = self.expected[at] if at < len(self.expected) else None
-        kind: str | None = "task" if isinstance(decision, TaskDecision) else "sensing"
-        if isinstance(kept, TaskDecision) and isinstance(decision, TaskDecision):
-            # By their bits: 0.0 and -0.0 are different actions.
-            bits = [np.array(each.action).tobytes() for each in (kept, decision)]
-            same = kept.step == decision.step and bits[0] == bits[1]
-        else:
-            same = kept == decision
-            # A state that differs after the same choice is nobody's decision.
-            kind = None if kept is not None and kept[:2] == decision[:2] else kind
-        if not same:
+        if kept != decision:
+            kind: str | None = "task"
+            if isinstance(decision, Sensed):
+                # A state that differs after the same choice is nobody's decision.
+                again = isinstance(kept, Sensed) and (
+                    (kept.step, kept.sensing_action) == (decision.step, decision.sensing_action)
+                )
+                kind = None if again else "sensing"
             raise DecidedOtherwiseError(self.trial, decision.step, kind)
         self._compared += 1
         self._on_same()

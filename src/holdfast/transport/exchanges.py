@@ -29,7 +29,7 @@ from typing import Final, NamedTuple, cast
 import msgspec
 
 from holdfast.transport.datagram_cipher import KNOWN_AFTER, LOSS_SAMPLE, OVERHEAD
-from holdfast.transport.redundancy import MAX_TIMEOUT_S, Paths, RedundantSender, RoundTripEstimator
+from holdfast.transport.redundancy import Paths, RedundantSender
 
 _REQUEST, _REPLY, _WORKING, PROBE, ECHO, _HEDGE = range(1, 7)
 
@@ -77,6 +77,36 @@ _FIRST_PROBE_INTERVAL_S: Final = 0.005
 
 _PROGRESS_INTERVAL_S: Final = 0.06
 """A service that computes an answer says so every 50 ms."""
+
+
+MAX_TIMEOUT_S: Final = 1.0
+_INITIAL_TIMEOUT_S: Final = 0.2
+_MIN_MARGIN_S: Final = 0.01
+"""Over the mean round trip: a busy machine replies a few milliseconds late."""
+
+
+class RoundTripEstimator:
+    """Mean and variation of round trips (RFC 6298), with a least margin of 10 ms."""
+
+    def __init__(self) -> None:
+        self.smoothed_s: float | None = None  # the exponentially weighted mean, once measured
+        self._variation_s = 0.0
+
+    def add(self, seconds: float) -> None:
+        """Add a measurement."""
+        if self.smoothed_s is None:
+            self.smoothed_s = seconds
+            self._variation_s = 0.5 * seconds
+        else:
+            self._variation_s += 0.25 * (abs(seconds - self.smoothed_s) - self._variation_s)
+            self.smoothed_s += 0.125 * (seconds - self.smoothed_s)
+
+    @property
+    def timeout_s(self) -> float:
+        """The retransmission timeout."""
+        if self.smoothed_s is None:
+            return _INITIAL_TIMEOUT_S
+        return min(MAX_TIMEOUT_S, self.smoothed_s + max(_MIN_MARGIN_S, 4.0 * self._variation_s))
 
 
 class ReceivedReply(NamedTuple):

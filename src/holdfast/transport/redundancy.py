@@ -1,4 +1,4 @@
-"""Sending datagrams over a lossy path: round-trip times, copies, and a budget for all repetition.
+"""Sending datagrams over a lossy path: copies, and a budget for all repetition.
 
 A message that may be lost is sent twice while the path loses datagrams. Copies, retransmissions and
 hedges are paid for from a budget of twice the bytes of first transmissions, so a congested path
@@ -17,41 +17,11 @@ from holdfast.transport.datagram_cipher import OVERHEAD
 COPY_DELAY_S: Final = 0.003
 """Between a message and its copy."""
 
-MAX_TIMEOUT_S: Final = 1.0
-
 _EXTRA_SHARE: Final = 2
 """Bytes of repetition earned by each byte of a first transmission."""
 
 _EXTRA_BURST_BYTES: Final = 8192
 _IP_AND_UDP_BYTES: Final = 28
-
-_INITIAL_TIMEOUT_S: Final = 0.2
-_MIN_MARGIN_S: Final = 0.01
-"""Over the mean round trip: a busy machine replies a few milliseconds late."""
-
-
-class RoundTripEstimator:
-    """Mean and variation of round trips (RFC 6298), with a least margin of 10 ms."""
-
-    def __init__(self) -> None:
-        self.smoothed_s: float | None = None  # the exponentially weighted mean, once measured
-        self._variation_s = 0.0
-
-    def add(self, seconds: float) -> None:
-        """Add a measurement."""
-        if self.smoothed_s is None:
-            self.smoothed_s = seconds
-            self._variation_s = 0.5 * seconds
-        else:
-            self._variation_s += 0.25 * (abs(seconds - self.smoothed_s) - self._variation_s)
-            self.smoothed_s += 0.125 * (seconds - self.smoothed_s)
-
-    @property
-    def timeout_s(self) -> float:
-        """The retransmission timeout."""
-        if self.smoothed_s is None:
-            return _INITIAL_TIMEOUT_S
-        return min(MAX_TIMEOUT_S, self.smoothed_s + max(_MIN_MARGIN_S, 4.0 * self._variation_s))
 
 
 class Paths(NamedTuple):

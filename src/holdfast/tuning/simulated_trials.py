@@ -16,7 +16,8 @@ from holdfast.config.loader import Configuration
 from holdfast.errors import InvalidValueError
 from holdfast.journal.run_directory import world_of
 from holdfast.numerics.arrays import whole
-from holdfast.planning.outcome import TRIAL_COLUMNS, SensingDecision, TrialResult
+from holdfast.planning.inputs import Sensed
+from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, SimulatorSettings, check_settings
 from holdfast.problems.attributes import sensing_costs
@@ -51,7 +52,7 @@ class SimulatedTrial(TrialResult, frozen=True, kw_only=True):
     def of(cls, result: TrialResult, problem: Problem) -> SimulatedTrial:
         """Return a result that has its decisions, with the price."""
         costs = sensing_costs(problem, optional=True)
-        looks = [each for each in result.decisions or () if isinstance(each, SensingDecision)]
+        looks = [each for each in result.decisions or () if isinstance(each, Sensed)]
         priced = getattr(problem, "sensing_costs", None) is not None
         price = sum(float(costs[each.sensing_action]) for each in looks) if priced else None
         fields = {name: getattr(result, name) for name in TrialResult.__struct_fields__}

@@ -11,7 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from holdfast.planning.inputs import Record, decode_record, encode_record
+from holdfast.journal.journal_file import encode
+from holdfast.journal.journal_reader import decode_records
+from holdfast.planning.inputs import Record
 from holdfast.planning.outcome import TrialResult
 
 
@@ -29,8 +31,8 @@ class Disk:
     def __init__(self, *, forces_out: bool) -> None:
         self._forces_out = forces_out
         self._trial = 0
-        self._records: list[bytes] = []
-        self._unsynced: list[int] = []
+        self._appended: list[bytes] = []
+        self._num_unsynced = 0
         self._first_of_process = True
         self._tail_is_certain = True
         self.results: dict[int, TrialResult] = {}
@@ -45,32 +47,31 @@ class Disk:
     def append(self, trial: int, records: Sequence[Record]) -> None:
         """Keep records of a trial."""
         self._trial = trial
-        self._records += map(encode_record, records)
+        self._appended.append(encode(records))
         if self._forces_out or self._first_of_process:
             # The first of a process also notes in which life of the machine it is written.
-            self._unsynced.clear()
+            self._num_unsynced = 0
             self._tail_is_certain = True
         else:
-            self._unsynced.append(len(records))
+            self._num_unsynced += 1
         self._first_of_process = False
 
     def add(self, result: TrialResult) -> None:
         """Keep the result of a trial instead of its records; it is on the disk."""
         self.results[result.trial] = result
-        self._records.clear()
-        self._unsynced.clear()
+        self._appended.clear()
+        self._num_unsynced = 0
         self._first_of_process = True
 
     def cut_power(self, lost_appends: int) -> None:
         """Lose so many of the last appends, of those that were not on the disk."""
-        for _ in range(min(lost_appends, len(self._unsynced))):
-            del self._records[len(self._records) - self._unsynced.pop() :]
-        self._unsynced.clear()
+        del self._appended[len(self._appended) - min(lost_appends, self._num_unsynced) :]
+        self._num_unsynced = 0
         self._tail_is_certain = self._tail_is_certain and self._forces_out
 
     def unfinished(self) -> Unfinished | None:
         """Return what there is of a trial that has not ended."""
-        if not self._records:
+        if not self._appended:
             return None
-        records = [decode_record(data) for data in self._records]
+        records = [record for data in self._appended for record in decode_records(data)]
         return Unfinished(self._trial, records, self._tail_is_certain)

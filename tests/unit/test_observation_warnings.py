@@ -18,7 +18,7 @@ from holdfast.planning.outcome import MoveResult, TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, OnLost, SimulatorSettings
 from holdfast.planning.tracking import Trial, replay
-from holdfast.protocol.observation_reports import ObservationReports
+from holdfast.protocol.observation_warnings import ObservationWarnings
 from holdfast.protocol.robot_events import Effects, Halt, LogEvent, RobotEffect, WriteRecords
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial
@@ -154,7 +154,7 @@ def test_hold_in_process() -> None:
 @pytest.mark.parametrize(("action", "named"), [(2, "2 (θ)"), (MOVE, "move")])
 def test_a_suspect_sensor_is_named_and_the_robot_is_not_lost(action: int, named: str) -> None:
     effects: Effects[RobotEffect] = Effects()
-    reports = ObservationReports(effects, LostSettings(on_lost="hold"))
+    reports = ObservationWarnings(effects, LostSettings(on_lost="hold"))
     trial = Trial(Planner(PROBLEM, PLANNING), 11, 0)
     trial.alarm = Verdict("sensor_suspect", action, 5, 6)
     trial.found = ObservationInfo(1.0, True, True)

@@ -30,7 +30,7 @@ _WHY = {
 _OR_ITS_SENSOR = ", or this sensor is dead: nothing else was sensed meanwhile"
 
 
-class ObservationReports:
+class ObservationWarnings:
     """Reports to ``effects`` what is observed in trials."""
 
     def __init__(self, effects: Effects[RobotEffect], lost: LostSettings) -> None:
