@@ -297,6 +297,7 @@ class Dispatcher(DecisionSource):
                 f"answered otherwise than the robot's own planner in step {wrong.step}"
             )
             self._calls.abandon_all(replica)
+            self.effects.counts["wrong_answer"] += 1
             self.effects.report(
                 "wrong_answer",
                 service=replica.name,
