@@ -326,7 +326,7 @@ class TestArguments:
         assert list(tmp_path.iterdir()) == []
 
     def test_a_host_without_a_service_is_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(CredentialsError, match=r"host '10\.0\.0\.7': only services"):
+        with pytest.raises(CredentialsError, match=r"10\.0\.0\.7': .*\(--service NAME;"):
             make_credentials(tmp_path, robots=["arm"], hosts=["10.0.0.7"])
 
     @pytest.mark.parametrize("days", [0, -1, 3651])
@@ -477,7 +477,7 @@ class TestCommand:
         assert f"{home / 'authority' / 'authority.key'} stays here" in done.stdout
         assert f"--tls {home / 'service'}" in done.stdout
         assert f"--tls {home / 'robot'}" in done.stdout
-        assert "10.0.0.7" in done.stdout
+        assert "--service tls/10.0.0.7:7447" in done.stdout
         load_credentials(home / "service", "service")
 
     def test_again_it_refuses_and_renews_if_told_to(

@@ -103,6 +103,7 @@ def test_what_does_not_belong_together_is_told_of_once(service: Service) -> None
     service.loop.look(6)
     assert service.events.names() == ["credentials"]
     assert "key.pem: is not the key of" in service.events.told[0][1]["reason"]
+    assert service.events.told[0][1]["pid"] == os.getpid()
     assert service.credentials.expires_s == before_s
     assert service.warnings == []  # that it ends soon is of no interest yet
     service.copy(new, "key")

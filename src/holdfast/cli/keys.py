@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from holdfast.errors import CredentialsError
 from holdfast.printable import printable
+from holdfast.runtime.addresses import host_and_port
 from holdfast.runtime.command_line import (
     Options,
     argument,
@@ -93,13 +95,19 @@ def main(arguments: Sequence[str]) -> int:
     directory = options.directory
     revokes = bool(options.revoke or options.revoke_serial)
     makes = options.robot or options.service or options.renew or options.rotate
+    makes = makes or not (revokes or options.list)
+    if options.host and not makes:
+        raise CredentialsError(
+            f"--host {options.host[0]}: stands in a service's certificate, and --revoke and --list "
+            "make none; leave it out, or add --renew --service NAME"
+        )
     with alone_in(directory, warn=warn):
         if revokes:
             revoked = revoke_credentials(
                 directory, names=options.revoke, serials=options.revoke_serial, warn=warn
             )
             sys.stdout.write(_account_of_revocation(directory, revoked))
-        if makes or not (revokes or options.list):
+        if makes:
             ring = make_credentials(
                 directory,
                 robots=options.robot,
@@ -110,7 +118,7 @@ def main(arguments: Sequence[str]) -> int:
                 rotate=options.rotate,
                 warn=warn,
             )
-            sys.stdout.write(_account(ring))
+            sys.stdout.write(_account(ring, *options.host[:1]))
         if options.list:
             listed = list_credentials(directory)
             sys.stdout.write("".join(f"{_line_of(each)}\n" for each in listed))
@@ -118,16 +126,18 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _account_of_revocation(directory: Path, revoked: Sequence[Issued]) -> str:
-    """Return what was revoked, and where to copy the list."""
-    lines = [f"revoked: {_line_of(each)}" for each in revoked]
-    if not lines:
-        return "All of these were revoked already; nothing was changed.\n"
+    """Return what was revoked, where the list must be, and from when on it holds."""
+    lines = [f"revoked: certificate {_line_of(each)}" for each in revoked]
+    lines = lines or ["All of these were revoked before; the list stays as it is."]
     lines += [
         "",
-        f"Copy {directory / 'NAME' / 'revoked.pem'} to each service and robot, beside its "
-        "certificate.pem.",
-        "Each 'holdfast serve' notices within seconds, and at once with the signal SIGHUP: links "
-        "of what is revoked end, others go on.",
+        f"A service still admits them until it has {directory / 'authority' / 'revoked.pem'}: "
+        "copy it to each service, beside its certificate.pem. Robots need it only if a service is "
+        "revoked.",
+        "'holdfast serve' reads it within seconds, at SIGHUP at once (under systemd: systemctl "
+        "reload holdfast-cloud), and logs 'credentials reloaded': links of what is revoked end, others go "
+        "on, and no restart is needed.",
+        f"For a new key: holdfast keys {directory} --rotate --robot NAME (or --service NAME)",
     ]
     return "\n".join(lines) + "\n"
 
@@ -144,24 +154,25 @@ def _line_of(issued: Issued) -> str:
     return ", ".join(parts)
 
 
-def _account(ring: KeyRing) -> str:
-    """Return what was made, and where it belongs."""
+def _account(ring: KeyRing, host: str = "HOST") -> str:
+    """Return what was made, and where it belongs; robots call the services at a host."""
     lines = []
     for made in ring.made:
         path = made.directory / "certificate.pem" if made.renewed else f"{made.directory}/"
         reached = f", reached at {', '.join(made.hosts)}" if made.hosts else ""
         until = made.expires.strftime("%Y-%m-%d")
-        lines.append(f"{path} for {made.role} {made.name!r}, valid until {until}{reached}")
+        lines.append(f"made: {path} for {made.role} {made.name!r}, valid until {until}{reached}")
     if any(made.renewed for made in ring.made):
         lines += [
             "",
             "Copy each certificate.pem over the old one. Services read it within "
             "seconds, and at once with the signal SIGHUP.",
         ]
+    endpoint = f"tls/{host_and_port(host, 7447)}"
     commands = [
         f"  holdfast serve --listen tls/0.0.0.0:7447 --tls {made.directory}"
         if made.role == "service"
-        else f"  holdfast run CONFIG --service tls/HOST:7447 --tls {made.directory}"
+        else f"  holdfast run CONFIG --service {endpoint} --tls {made.directory}"
         for made in ring.made
         if not made.renewed
     ]

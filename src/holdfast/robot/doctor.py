@@ -242,6 +242,8 @@ class Examination:
             own = endpoint.is_local_socket or endpoint.is_loopback
             at = endpoint if own else f"{endpoint.protocol}/0.0.0.0:{endpoint.port}"
             advice = f"start the service there: holdfast serve --listen {at}"
+            if endpoint.is_encrypted:
+                advice += " --tls KEYS/service; 'holdfast keys KEYS' makes both ends' credentials"
             raise _LayerError(f"{what}: refused, nothing listens there", advice) from error
         except OSError as error:
             raise _LayerError(f"{what}: {system_words(error.errno)}", _OPEN_IT) from error
@@ -249,7 +251,7 @@ class Examination:
 
     def _own_credentials(self) -> _Seen:
         if self._offload.tls is None:
-            advice = "'holdfast keys DIR' makes them; give this robot's with --tls DIR"
+            advice = "give this robot's, --tls KEYS/robot; 'holdfast keys KEYS' makes both ends'"
             return _Seen("none was given", advice)
         warnings: list[str] = []
         try:
@@ -338,6 +340,8 @@ class Examination:
         except HoldfastError as error:
             raise _LayerError(f"this robot's own planner fails: {error}") from error
         session, slow = os.urandom(16), "it is too slow for this problem, or has too much to do"
+        described = own[0].request.session_configuration
+        assert described is not None
         for decision in own:
             request = msgspec.structs.replace(decision.request, session=session)
             began = time.perf_counter()
@@ -346,7 +350,7 @@ class Examination:
                     await asyncio.sleep(1e-3 * busy.retry_after_ms)
             took_s = time.perf_counter() - began
             if refused := _of_kind(Refused, replies):
-                advice = "deploy the same holdfast and problem at both ends"
+                advice = _at_service(refused.code, described.problem)
                 raise _LayerError(f"{refused.code}: {refused.text}", advice)
             if answer_in(replies) != decision.answer:
                 other = "answers otherwise than this robot's own planner"
@@ -354,8 +358,6 @@ class Examination:
                     other = "comes to another state than this robot"
                 raise _LayerError(f"the service {other}, with the same code", _DISTRUST)
         self._decision_s = took_s, decision.took_s
-        described = own[0].request.session_configuration
-        assert described is not None
         seen = f"{described.problem}: the same code and settings; {len(own)} decisions are"
         return _Seen(f"{seen} the robot's own, bit for bit")
 
@@ -391,6 +393,21 @@ class Examination:
 
 def _of_kind(kind: type[_Kind], replies: list[Reply]) -> _Kind | None:
     return next((reply for reply in replies if isinstance(reply, kind)), None)
+
+
+def _at_service(code: str, problem: str) -> str:
+    """Return what to do at a service that refuses; of other codes the text says it."""
+    if code == "other_code":
+        return "deploy the same holdfast and problem at both ends, and start the service again"
+    if code != "unknown_problem":
+        return ""
+    module, is_class, _ = problem.partition(":")
+    if not is_class:
+        return "install there the package that has this problem, and start the service again"
+    return (
+        f"start the service with --problem {problem}; {module.replace('.', '/')}.py, the same as "
+        "here, must be in the directory where it starts, or in that of --problem-directory DIR"
+    )
 
 
 def _now() -> str:
