@@ -33,6 +33,7 @@ class ServiceVanished(NamedTuple):
 
     service: str
     incarnation: str
+    reason: str = ""
 
 
 class ReplyReceived(NamedTuple):
