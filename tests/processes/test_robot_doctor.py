@@ -465,8 +465,7 @@ class TestProblem:
         cloud = service_of(site, "tcp")
         seen = look(site, cloud.endpoint, site.configure(test_other_code.DOCUMENT))
         assert "is not known to this service" in seen["problem"]["seen"]
-        name = test_other_code.DOCUMENT["problem"]
-        assert f"start the service with --problem {name}; " in seen["problem"]["advice"]
+        assert f"service with --problem {test_other_code.NAME}; " in seen["problem"]["advice"]
         assert "--problem-directory DIR" in seen["problem"]["advice"]
 
     @pytest.mark.parametrize("what", ["sensing"])

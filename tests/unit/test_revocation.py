@@ -333,7 +333,7 @@ class TestCommand:
         done = run_keys(capsys, tmp_path, "--revoke", "anna")
         assert (done.code, done.stderr) == (0, "")
         assert f"certificate {serial_of(tmp_path / 'anna'):040x}, robot 'anna'" in done.stdout
-        assert f"until it has {tmp_path / 'authority' / REVOKED_FILE}: copy it" in done.stdout
+        assert f"lacks {tmp_path / 'authority' / REVOKED_FILE} still admits them" in done.stdout
         assert {path.name for path in tmp_path.iterdir()} == {"authority", "anna", "cloud"}
         again = run_keys(capsys, tmp_path, "--revoke", "anna")
         assert again.code == 0

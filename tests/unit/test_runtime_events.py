@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 from holdfast.protocol.status import Status
 from holdfast.runtime.events import _ERRORS, _WARNINGS, BoundedEventLog, severity
@@ -32,10 +33,10 @@ class RecordingSink:
     """Keeps the events that it gets."""
 
     def __init__(self) -> None:
-        self.events: list[tuple[str, dict[str, object]]] = []
+        self.events: list[tuple[str, dict[str, Any]]] = []
         self.closed = False
 
-    def event(self, name: str, /, **fields: object) -> None:
+    def event(self, name: str, /, **fields: Any) -> None:
         self.events.append((name, fields))
 
     def close(self) -> None:

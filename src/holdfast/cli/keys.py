@@ -82,12 +82,7 @@ class KeysOptions(Options):
 def main(arguments: Sequence[str]) -> int:
     """Make, revoke or list credentials, and return the exit code."""
     options = KeysOptions.parse("keys", arguments)
-    from holdfast.transport.key_ring import (
-        alone_in,
-        list_credentials,
-        make_credentials,
-        revoke_credentials,
-    )
+    from holdfast.transport import key_ring
 
     def warn(text: str) -> None:
         sys.stderr.write(f"warning: {printable(text)}\n")
@@ -101,14 +96,14 @@ def main(arguments: Sequence[str]) -> int:
             f"--host {options.host[0]}: stands in a service's certificate, and --revoke and --list "
             "make none; leave it out, or add --renew --service NAME"
         )
-    with alone_in(directory, warn=warn):
+    with key_ring.alone_in(directory, warn=warn):
         if revokes:
-            revoked = revoke_credentials(
+            revoked = key_ring.revoke_credentials(
                 directory, names=options.revoke, serials=options.revoke_serial, warn=warn
             )
             sys.stdout.write(_account_of_revocation(directory, revoked))
         if makes:
-            ring = make_credentials(
+            ring = key_ring.make_credentials(
                 directory,
                 robots=options.robot,
                 services=options.service,
@@ -120,7 +115,7 @@ def main(arguments: Sequence[str]) -> int:
             )
             sys.stdout.write(_account(ring, *options.host[:1]))
         if options.list:
-            listed = list_credentials(directory)
+            listed = key_ring.list_credentials(directory)
             sys.stdout.write("".join(f"{_line_of(each)}\n" for each in listed))
     return 0
 
@@ -131,12 +126,10 @@ def _account_of_revocation(directory: Path, revoked: Sequence[Issued]) -> str:
     lines = lines or ["All of these were revoked before; the list stays as it is."]
     lines += [
         "",
-        f"A service still admits them until it has {directory / 'authority' / 'revoked.pem'}: "
-        "copy it to each service, beside its certificate.pem. Robots need it only if a service is "
-        "revoked.",
+        f"An end that lacks {directory / 'authority' / 'revoked.pem'} still admits them: copy it "
+        "beside the certificate.pem of each service; if a service is revoked, of each robot too.",
         "'holdfast serve' reads it within seconds, at SIGHUP at once (under systemd: systemctl "
-        "reload holdfast-cloud), and logs 'credentials reloaded': links of what is revoked end, others go "
-        "on, and no restart is needed.",
+        "reload holdfast-cloud), and logs 'credentials reloaded'; their links end, others go on.",
         f"For a new key: holdfast keys {directory} --rotate --robot NAME (or --service NAME)",
     ]
     return "\n".join(lines) + "\n"

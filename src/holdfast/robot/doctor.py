@@ -71,6 +71,13 @@ _NO_HOLDFAST: Final = "is it another program, at tls/... or udp/..., or a proces
 _DISTRUST: Final = "do not use it before you know why (docs/trust.md)"
 _OPEN_IT: Final = "let it through the firewalls on the way, or mend the VPN"
 
+_AT_SERVICE: Final = {
+    "other_code": "deploy the same holdfast and problem at both ends, and start the service again",
+    "unknown_problem": "start the service with --problem {0}; its module must be installed there, "
+    "or lie, the same as here, where the service starts or in --problem-directory DIR",
+}
+"""What to do about a refusal, with the problem's name; of other codes the text says it."""
+
 _Kind = TypeVar("_Kind")
 _Look: TypeAlias = Callable[..., Awaitable["_Seen | None"]]
 State: TypeAlias = Literal["ok", "warns", "fails", "-"]
@@ -350,7 +357,7 @@ class Examination:
                     await asyncio.sleep(1e-3 * busy.retry_after_ms)
             took_s = time.perf_counter() - began
             if refused := _of_kind(Refused, replies):
-                advice = _at_service(refused.code, described.problem)
+                advice = _AT_SERVICE.get(refused.code, "").format(described.problem)
                 raise _LayerError(f"{refused.code}: {refused.text}", advice)
             if answer_in(replies) != decision.answer:
                 other = "answers otherwise than this robot's own planner"
@@ -393,21 +400,6 @@ class Examination:
 
 def _of_kind(kind: type[_Kind], replies: list[Reply]) -> _Kind | None:
     return next((reply for reply in replies if isinstance(reply, kind)), None)
-
-
-def _at_service(code: str, problem: str) -> str:
-    """Return what to do at a service that refuses; of other codes the text says it."""
-    if code == "other_code":
-        return "deploy the same holdfast and problem at both ends, and start the service again"
-    if code != "unknown_problem":
-        return ""
-    module, is_class, _ = problem.partition(":")
-    if not is_class:
-        return "install there the package that has this problem, and start the service again"
-    return (
-        f"start the service with --problem {problem}; {module.replace('.', '/')}.py, the same as "
-        "here, must be in the directory where it starts, or in that of --problem-directory DIR"
-    )
 
 
 def _now() -> str:

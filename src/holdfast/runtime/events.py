@@ -25,25 +25,10 @@ _BURST = 20
 
 _WARNINGS = frozenset(
     [
-        "launch_failed",
-        "recovery_exited",
-        "service_vanished",
-        "service_suspected",
-        "unreachable",
-        "holding",
-        "unexplained",
-        "no_reading",
-        "lost",
-        "sensor_suspect",
-        "reinitialised",
-        "malformed_reply",
-        "disagreement",
-        "refused",
-        "verification_failed",
-        "distrusted",
-        "missed_ticks",
-        "performed_unseen",
-        "insecure",
+        *("launch_failed", "recovery_exited", "service_vanished", "service_suspected", "refused"),
+        *("unreachable", "insecure", "malformed_reply", "holding", "missed_ticks"),
+        *("disagreement", "verification_failed", "distrusted", "performed_unseen"),
+        *("unexplained", "no_reading", "lost", "sensor_suspect", "reinitialised"),
     ]
 )
 _ERRORS = frozenset(

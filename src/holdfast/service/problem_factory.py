@@ -104,7 +104,5 @@ class ProblemFactory:
                 return registry.problem_class(name)
         known = ", ".join(sorted({*self._names, *self._classes}))
         hint = f"; it must be started with --problem {name}, since this is a class in a file"
-        raise UnknownProblemError(
-            f"problem {name}: is not known to this service{hint if ':' in name else ''}; known are "
-            f"{known}"
-        )
+        text = f"problem {name}: is not known to this service{hint if ':' in name else ''}"
+        raise UnknownProblemError(f"{text}; known are {known}")

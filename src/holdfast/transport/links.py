@@ -70,7 +70,9 @@ _PING: Final = encode_frame(PING)
 
 _NO_TLS: Final = "does not speak TLS; as at that end, write tls/... or udp/... with --tls DIR"
 _EXPIRED: Final = "has a certificate that has expired"
-_NO_GOODBYE: Final = "closed the connection without a goodbye: was killed, or heard nothing from here"
+_NO_GOODBYE: Final = (
+    "closed the connection without a goodbye: was killed, or heard nothing from here"
+)
 
 
 class LinkOwner(ABC):
