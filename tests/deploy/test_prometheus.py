@@ -47,7 +47,8 @@ def played(text: str, directory: Path, scrape: str = "job", rules: Path = RULES)
             text = re.sub(rf'job="{job}",instance="(\w)"', pod, text)
             pod = rf'job: {its}, namespace: {name}, instance: "10.0.0.7:8080", pod: \1'
             text = re.sub(rf"job: {job}, instance: (\w)", pod, text)
-            text = text.replace(f"job: {job}}}", f"job: {its}}}")
+            text = text.replace(f"job: {job}}}", f"job: {its}, namespace: {name}}}")
+            text = text.replace(f"'{job}: no service", f"'{its}: no service")
     (directory / "played.yaml").write_text(text)
     return directory / "played.yaml"
 

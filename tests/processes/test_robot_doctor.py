@@ -192,10 +192,11 @@ class TestTheWay:
         seen = look(site, f"unix/{site.directory / 's'}")
         assert_fails(seen, "name", "is not there")
 
-    def test_a_port_at_which_nothing_listens(self, site: Site) -> None:
-        endpoint = f"tcp/127.0.0.1:{free_port()}"
+    @pytest.mark.parametrize(("protocol", "more"), [("tcp", ""), ("tls", " --tls KEYS/service; ")])
+    def test_a_port_at_which_nothing_listens(self, protocol: str, more: str, site: Site) -> None:
+        endpoint = f"{protocol}/127.0.0.1:{free_port()}"
         seen = look(site, endpoint)
-        assert_fails(seen, "port", "refused", f"holdfast serve --listen {endpoint}")
+        assert_fails(seen, "port", "refused", f"holdfast serve --listen {endpoint}{more}")
 
     def test_a_port_that_does_not_answer(self, site: Site) -> None:
         with contextlib.ExitStack() as stack:
@@ -377,7 +378,7 @@ class TestCertificates:
     @pytest.mark.parametrize(
         ("robot", "what", "to_do"),
         [
-            (None, "ours: none was given", "--tls DIR"),
+            (None, "ours: none was given", "--tls KEYS/robot"),
             ("keys/old", "certificate.pem: has expired (valid from ", ""),
             ("keys/early", "certificate.pem: is not valid yet; is a clock wrong?", ""),
             ("keys/thief", "certificate.pem: has been revoked", ""),
@@ -464,7 +465,8 @@ class TestProblem:
         cloud = service_of(site, "tcp")
         seen = look(site, cloud.endpoint, site.configure(test_other_code.DOCUMENT))
         assert "is not known to this service" in seen["problem"]["seen"]
-        assert "(--problem)" in seen["problem"]["seen"]
+        assert f"service with --problem {test_other_code.NAME}; " in seen["problem"]["advice"]
+        assert "--problem-directory DIR" in seen["problem"]["advice"]
 
     @pytest.mark.parametrize("what", ["sensing"])
     def test_a_service_that_decides_otherwise(self, what: str, site: Site) -> None:

@@ -321,7 +321,8 @@ class TestServing:
             while "stopping" not in service.process.stderr.readline():
                 pass
             # Whoever is owed nothing leaves at once, for nobody else is there.
-            assert other.events.get(timeout=PATIENCE_S) == ServiceVanished("service", incarnation)
+            gone = ServiceVanished("service", incarnation, "said goodbye")
+            assert other.events.get(timeout=PATIENCE_S) == gone
             assert other.ask(encode(Robot(key=2).request())) == []
             host, _, port = service.endpoint.removeprefix("tcp/").rpartition(":")
             with pytest.raises(ConnectionRefusedError):

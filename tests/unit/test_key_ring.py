@@ -306,27 +306,25 @@ class TestRotation:
 
 class TestArguments:
     @pytest.mark.parametrize(
-        "name", ["", ".", "..", "a/b", "-x", ".hidden", "authority", "a" * 65, "a b", "é", "a\n"]
+        ("says", "what", "values"),
+        [
+            ("name ", "robots", ["", ".", "..", "a/b", "-x", ".hidden", "authority"]),
+            ("at most 64 letters", "robots", ["a" * 65, "a b", "é", "a\n"]),
+            ("'service': stands twice", "robots", ["service"]),
+            ("is no host name and no IP", "hosts", ["", "tls/10.0.0.7:7447", "10.0.0.7:7447"]),
+            ("is no host name and no IP", "hosts", ["[::1]", "a..b", "*.lan", "é.lan", "a b"]),
+        ],
     )
-    def test_names_that_are_no_directories_are_refused(self, tmp_path: Path, name: str) -> None:
-        with pytest.raises(CredentialsError, match="name "):
-            make_credentials(tmp_path, robots=[name])
-        assert list(tmp_path.iterdir()) == []
-
-    def test_a_name_stands_once(self, tmp_path: Path) -> None:
-        with pytest.raises(CredentialsError, match="'x': stands twice"):
-            make_credentials(tmp_path, robots=["x"], services=["x"])
-
-    @pytest.mark.parametrize(
-        "host", ["", "tls/10.0.0.7:7447", "10.0.0.7:7447", "[::1]", "a..b", "*.lan", "é.lan", "a b"]
-    )
-    def test_hosts_that_are_none_are_refused(self, tmp_path: Path, host: str) -> None:
-        with pytest.raises(CredentialsError, match="is no host name and no IP address"):
-            make_credentials(tmp_path, hosts=[host])
+    def test_names_and_hosts_that_are_none_are_refused(
+        self, tmp_path: Path, says: str, what: str, values: list[str]
+    ) -> None:
+        for value in values:
+            with pytest.raises(CredentialsError, match=says):
+                make_credentials(tmp_path, **{"services": ["service"], what: [value]})
         assert list(tmp_path.iterdir()) == []
 
     def test_a_host_without_a_service_is_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(CredentialsError, match=r"host '10\.0\.0\.7': only services"):
+        with pytest.raises(CredentialsError, match=r"10\.0\.0\.7': .*\(--service NAME;"):
             make_credentials(tmp_path, robots=["arm"], hosts=["10.0.0.7"])
 
     @pytest.mark.parametrize("days", [0, -1, 3651])
@@ -344,8 +342,6 @@ class TestArguments:
         (tmp_path / name).mkdir()
         make_credentials(tmp_path, robots=[name])
         assert (tmp_path / name / "key.pem").exists()
-        with pytest.raises(CredentialsError, match="at most 64 letters"):
-            make_credentials(tmp_path, robots=[name + "x"])
 
     def test_as_many_names_as_one_call_may_have(
         self, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -478,7 +474,7 @@ class TestCommand:
         assert f"{home / 'authority' / 'authority.key'} stays here" in done.stdout
         assert f"--tls {home / 'service'}" in done.stdout
         assert f"--tls {home / 'robot'}" in done.stdout
-        assert "10.0.0.7" in done.stdout
+        assert "--service tls/10.0.0.7:7447" in done.stdout
         load_credentials(home / "service", "service")
 
     def test_again_it_refuses_and_renews_if_told_to(
@@ -501,8 +497,5 @@ class TestCommand:
         assert {path.name for path in tmp_path.iterdir()} == {"authority", "a", "b", "c"}
         # Each has its own command.
         commands = [line.split() for line in done.stdout.splitlines() if "--tls" in line]
-        assert [(each[1], each[-1]) for each in commands] == [
-            ("serve", str(tmp_path / "c")),
-            ("run", str(tmp_path / "a")),
-            ("run", str(tmp_path / "b")),
-        ]
+        places = [(each[1], Path(each[-1]).relative_to(tmp_path).name) for each in commands]
+        assert places == [("serve", "c"), ("run", "a"), ("run", "b")]

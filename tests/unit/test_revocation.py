@@ -330,12 +330,12 @@ class TestCommand:
         make_credentials(tmp_path, robots=["anna"], services=["cloud"])
         done = run_keys(capsys, tmp_path, "--revoke", "anna")
         assert (done.code, done.stderr) == (0, "")
-        assert f"revoked: {serial_of(tmp_path / 'anna'):040x}, robot 'anna'" in done.stdout
-        assert "SIGHUP" in done.stdout
+        assert f"certificate {serial_of(tmp_path / 'anna'):040x}, robot 'anna'" in done.stdout
+        assert f"lacks {tmp_path / 'authority' / REVOKED_FILE} still admits them" in done.stdout
         assert {path.name for path in tmp_path.iterdir()} == {"authority", "anna", "cloud"}
         again = run_keys(capsys, tmp_path, "--revoke", "anna")
         assert again.code == 0
-        assert "revoked already" in again.stdout
+        assert "were revoked before" in again.stdout
 
     def test_it_revokes_by_number_and_lists(
         self, capsys: pytest.CaptureFixture[str], tmp_path: Path
@@ -365,6 +365,7 @@ class TestCommand:
         [
             (["--revoke", "clara"], "name 'clara': has no certificate of"),
             (["--revoke-serial", "xyz"], "'xyz'; allowed are hexadecimal numbers"),
+            (["--list", "--host", "a.example"], "--host a.example: stands in a service's"),
         ],
     )
     def test_what_cannot_be(

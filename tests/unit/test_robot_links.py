@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.unit.test_runtime_events import RecordingSink
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import HoldfastError, TransportError
@@ -14,15 +15,6 @@ from holdfast.robot.memo_cache import MemoizingPlanner
 from holdfast.runtime.events import BoundedEventLog
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
-
-
-class Events(BoundedEventLog):
-    def __init__(self) -> None:
-        super().__init__()
-        self.names: list[str] = []
-
-    def event(self, name: str, /, **fields: object) -> None:
-        self.names.append(name)
 
 
 def configuration(**changes: Any) -> Configuration:
@@ -50,9 +42,9 @@ def test_with_services_there_is_a_local_one_unless_it_is_never_launched() -> Non
 
 
 def test_a_link_without_encryption_to_another_machine_is_reported() -> None:
-    events = Events()
+    events = RecordingSink()
     make_links(configuration(**{"offload.services": ["tcp/192.0.2.1:7600"]}), None, events)
-    assert events.names == ["insecure"]
+    assert [name for name, _ in events.events] == ["insecure"]
 
 
 def test_a_service_that_cannot_be_used_is_refused_with_its_key() -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from tests.robot_world import Misleading, World
+from tests.unit.test_verification import lie, other_actions
 
 from holdfast.planning.settings import SimulatorSettings
 from holdfast.protocol.robot_events import Timing
@@ -86,6 +87,13 @@ def test_what_the_observations_have_shown() -> None:
     assert samples["holdfast_robot_lost_total", ()] > 0
 
 
+def test_a_wrong_answer() -> None:
+    world = World(verify_share=0.0)
+    lie(world, "cloud", other_actions(77.7), after=2)
+    world.complete()
+    assert told(RobotMetrics(), world)["holdfast_robot_wrong_answers_total", ()] == 1
+
+
 def test_a_robot_in_a_trial_that_nobody_decides_for() -> None:
     world, metrics = World(launch="never"), RobotMetrics()
     world.start(present=False)
@@ -100,7 +108,7 @@ def test_a_robot_in_a_trial_that_nobody_decides_for() -> None:
 
 def test_the_alerts_watch_what_is_told() -> None:
     watched = set(re.findall(r"\bholdfast_robot_\w+", RULES.read_text(encoding="utf-8")))
-    assert len(watched) == 5
+    assert len(watched) == 6
     assert watched <= {name for name, _ in told(RobotMetrics(), world_of())}
 
 

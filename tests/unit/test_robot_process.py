@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from tests.recordings import robot_configuration
+from tests.unit.test_runtime_events import RecordingSink
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import HeldError, ProblemError, TrialError
@@ -53,15 +54,15 @@ def configuration(tmp_path: Path) -> Configuration:
     return robot_configuration(tmp_path, num_trials=2)
 
 
-class Robots:
+class Robots(RecordingSink):
     """Makes robots that go on in one directory, and keeps what they say."""
 
     def __init__(self, configuration: Configuration, path: Path) -> None:
+        super().__init__()
         self.configuration = configuration
         self.links: Links | None = None
         self.results: list[TrialResult] = []
         self.on_timing: Callable[[Timing], None] = lambda _: None
-        self.told: list[tuple[str, dict[str, object]]] = []
         self.path = path
         self.maker = load_environment(configuration)
         self.on_order: Callable[[PlanningState, Act | Sense], None] | None = None
@@ -92,12 +93,6 @@ class Robots:
     def _on_result(self, result: TrialResult) -> None:
         self.directory.add(result)
         self.results.append(result)
-
-    def event(self, name: str, /, **fields: object) -> None:
-        self.told.append((name, fields))
-
-    def close(self) -> None:
-        pass
 
     @property
     def digests(self) -> list[str]:
@@ -360,7 +355,7 @@ def test_an_error_in_what_is_called_on_the_loop_ends_the_run(robots: Robots) -> 
     robots.on_timing = fail
     with pytest.raises(TrialError, match=r"trial 0 \(seed 3\), step 0: .* raised OwnError"):
         robots.run()
-    assert robots.told[-1][0] == "stopped"
+    assert robots.events[-1][0] == "stopped"
 
 
 def test_an_error_of_whatever_else_runs_on_the_loop_ends_the_run(robots: Robots) -> None:
@@ -401,7 +396,7 @@ def test_what_its_own_planner_refuses_is_said_and_ends_the_run(
     monkeypatch.setattr(own_planner, "_answer", refuse)
     with pytest.raises(ProblemError, match="policy gives nan"):
         robots.run()
-    assert ("stopped", {"reason": "policy gives nan"}) in robots.told
+    assert ("stopped", {"reason": "policy gives nan"}) in robots.events
 
 
 def test_a_problem_that_fails_is_named_with_the_step(

@@ -2,18 +2,41 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+from typing import Any
+
 from holdfast.protocol.status import Status
-from holdfast.runtime.events import BoundedEventLog, severity
+from holdfast.runtime.events import _ERRORS, _WARNINGS, BoundedEventLog, severity
+
+ROOT = Path(__file__).parents[2]
+REPORTS = re.compile(
+    r"\b_?(?:report|event|note|on_event|write_event|bounded)\("
+    r"""\s*(?:trial,\s*|"robot", |options\.name, |component, )?"(?!robot")([a-z_]+)\""""
+)
+
+
+def test_the_pages_have_every_event_and_no_other() -> None:
+    ros1 = (ROOT / "ros" / "holdfast_ros" / "holdfast_ros").glob("ros1_*.py")
+    files = (*(ROOT / "src").rglob("*.py"), *ros1)
+    reported = {name for file in files for name in REPORTS.findall(file.read_text("utf-8"))}
+    assert "waiting" in reported
+    listed: set[str] = set()
+    for page, title in (("status.md", "Events"), ("operations.md", "The log")):
+        text = (ROOT / "docs" / page).read_text("utf-8").partition(f"\n## {title}\n")[2]
+        rows = re.findall(r"^\| (.+?) \|", text.partition("\n## ")[0], re.MULTILINE)
+        listed |= {name for row in rows for name in re.findall("`([a-z_]+)`", row)}
+    assert listed == reported | _WARNINGS | _ERRORS
 
 
 class RecordingSink:
     """Keeps the events that it gets."""
 
     def __init__(self) -> None:
-        self.events: list[tuple[str, dict[str, object]]] = []
+        self.events: list[tuple[str, dict[str, Any]]] = []
         self.closed = False
 
-    def event(self, name: str, /, **fields: object) -> None:
+    def event(self, name: str, /, **fields: Any) -> None:
         self.events.append((name, fields))
 
     def close(self) -> None:

@@ -17,7 +17,7 @@ from holdfast.transport.key_ring import make_credentials
             (["--listen", f"tcp/{address}"], [f"tcp/{address}", "--tls", "--insecure"])
             for address in ("0.0.0.0:0", "[::]:0", "192.0.2.1:7447")
         ),
-        (["--listen", "tls/127.0.0.1:0"], ["--tls DIR"]),
+        (["--listen", "tls/127.0.0.1:0"], ["--tls KEYS/NAME"]),
         (["--listen", "tcp/127.0.0.1:0", "--tls", "keys/service"], ["tcp does not use the cred"]),
         (["--listen", "quic/127.0.0.1:0"], ["quic"]),
         (["--listen", "tcp/127.0.0.1"], ["no port"]),

@@ -13,24 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.unit.test_runtime_events import RecordingSink
 
 from holdfast.service.credentials import ServiceCredentials
 from holdfast.transport.key_ring import make_credentials, revoke_credentials
 from holdfast.transport.service_end import StreamServiceTransport
 
 
-class Events:
-    def __init__(self) -> None:
-        self.told: list[tuple[str, dict[str, Any]]] = []
-
-    def event(self, event: str, /, **fields: Any) -> None:
-        self.told.append((event, fields))
-
-    def close(self) -> None:
-        """Nothing is open."""
-
+class Events(RecordingSink):
     def names(self) -> list[str]:
-        return [name for name, _ in self.told]
+        return [name for name, _ in self.events]
 
 
 class Looks(asyncio.SelectorEventLoop):
@@ -80,7 +72,7 @@ def service(tmp_path: Path) -> Any:
 
 def test_what_has_not_changed_is_not_read(service: Service) -> None:
     service.loop.look(5)
-    assert service.events.told == []
+    assert service.events.events == []
 
 
 def test_what_has_changed_is_read_once_and_only_when_it_has_stayed_so(service: Service) -> None:
@@ -90,7 +82,7 @@ def test_what_has_changed_is_read_once_and_only_when_it_has_stayed_so(service: S
     service.loop.look()
     service.copy(new, "key")
     service.loop.look()
-    assert service.events.told == []
+    assert service.events.events == []
     service.loop.look(5)
     assert service.events.names() == ["credentials_reloaded"]
     assert service.credentials.expires_s < before_s
@@ -102,7 +94,8 @@ def test_what_does_not_belong_together_is_told_of_once(service: Service) -> None
     service.copy(new, "certificate")
     service.loop.look(6)
     assert service.events.names() == ["credentials"]
-    assert "key.pem: is not the key of" in service.events.told[0][1]["reason"]
+    assert "key.pem: is not the key of" in service.events.events[0][1]["reason"]
+    assert service.events.events[0][1]["pid"] == os.getpid()
     assert service.credentials.expires_s == before_s
     assert service.warnings == []  # that it ends soon is of no interest yet
     service.copy(new, "key")

@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import pytest
 from tests.unit.test_protocol_service import Robot, content, planning_of
+from tests.unit.test_runtime_events import RecordingSink
 
 from holdfast.errors import MessageError
 from holdfast.problems.capsule_robot import CapsuleRobot
@@ -110,19 +111,6 @@ class Held(CapsuleRobot):
         return super().policy(states, stage)
 
 
-class Log:
-    """Keeps the events that it is told."""
-
-    def __init__(self) -> None:
-        self.events: list[tuple[str, dict[str, object]]] = []
-
-    def event(self, name: str, /, **fields: object) -> None:
-        self.events.append((name, fields))
-
-    def close(self) -> None:
-        pass
-
-
 class Joined:
     """A shell on a network."""
 
@@ -139,7 +127,7 @@ class Joined:
 
         self.network = InProcessNetwork()
         self.timed: list[tuple[str, float, float]] = []
-        self.log = Log()
+        self.log = RecordingSink()
         self.shell = ServiceShell(
             Service(make_problem, workers, ServiceLimits(**limits)),
             self.network.service("service", "boot"),
@@ -477,7 +465,9 @@ class Call:
 
 def scripted(*jobs: tuple[str, float, Callable[[], object]]) -> tuple[Script, ServiceShell]:
     machine = Script(*(StartJob(cast(Job, Scripted(kind, run)), s, True) for kind, s, run in jobs))
-    return machine, ServiceShell(machine, InProcessNetwork().service("service", "boot"), Log())
+    return machine, ServiceShell(
+        machine, InProcessNetwork().service("service", "boot"), RecordingSink()
+    )
 
 
 async def test_a_call_whose_link_has_ended_is_reported_once_and_not_within_a_reply() -> None:

@@ -19,10 +19,10 @@ def test_a_service_that_vanishes_ends_its_own_calls_after_that() -> None:
     calls.begin(2, "b")
     calls.begin(3, "a")
     calls.appeared("cloud", "i1")
-    calls.vanished("cloud", "i1", "a")
+    calls.vanished("cloud", "i1", "a", "said goodbye")
     assert events == [
         ServiceAppeared("cloud", "i1"),
-        ServiceVanished("cloud", "i1"),
+        ServiceVanished("cloud", "i1", "said goodbye"),
         CallEnded(1),
         CallEnded(3),
     ]

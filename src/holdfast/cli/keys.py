@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from holdfast.errors import CredentialsError
 from holdfast.printable import printable
+from holdfast.runtime.addresses import host_and_port
 from holdfast.runtime.command_line import (
     Options,
     argument,
@@ -80,12 +82,7 @@ class KeysOptions(Options):
 def main(arguments: Sequence[str]) -> int:
     """Make, revoke or list credentials, and return the exit code."""
     options = KeysOptions.parse("keys", arguments)
-    from holdfast.transport.key_ring import (
-        alone_in,
-        list_credentials,
-        make_credentials,
-        revoke_credentials,
-    )
+    from holdfast.transport import key_ring
 
     def warn(text: str) -> None:
         sys.stderr.write(f"warning: {printable(text)}\n")
@@ -93,14 +90,20 @@ def main(arguments: Sequence[str]) -> int:
     directory = options.directory
     revokes = bool(options.revoke or options.revoke_serial)
     makes = options.robot or options.service or options.renew or options.rotate
-    with alone_in(directory, warn=warn):
+    makes = makes or not (revokes or options.list)
+    if options.host and not makes:
+        raise CredentialsError(
+            f"--host {options.host[0]}: stands in a service's certificate, and --revoke and --list "
+            "make none; leave it out, or add --renew --service NAME"
+        )
+    with key_ring.alone_in(directory, warn=warn):
         if revokes:
-            revoked = revoke_credentials(
+            revoked = key_ring.revoke_credentials(
                 directory, names=options.revoke, serials=options.revoke_serial, warn=warn
             )
             sys.stdout.write(_account_of_revocation(directory, revoked))
-        if makes or not (revokes or options.list):
-            ring = make_credentials(
+        if makes:
+            ring = key_ring.make_credentials(
                 directory,
                 robots=options.robot,
                 services=options.service,
@@ -110,24 +113,24 @@ def main(arguments: Sequence[str]) -> int:
                 rotate=options.rotate,
                 warn=warn,
             )
-            sys.stdout.write(_account(ring))
+            sys.stdout.write(_account(ring, *options.host[:1]))
         if options.list:
-            listed = list_credentials(directory)
+            listed = key_ring.list_credentials(directory)
             sys.stdout.write("".join(f"{_line_of(each)}\n" for each in listed))
     return 0
 
 
 def _account_of_revocation(directory: Path, revoked: Sequence[Issued]) -> str:
-    """Return what was revoked, and where to copy the list."""
-    lines = [f"revoked: {_line_of(each)}" for each in revoked]
-    if not lines:
-        return "All of these were revoked already; nothing was changed.\n"
+    """Return what was revoked, where the list must be, and from when on it holds."""
+    lines = [f"revoked: certificate {_line_of(each)}" for each in revoked]
+    lines = lines or ["All of these were revoked before; the list stays as it is."]
     lines += [
         "",
-        f"Copy {directory / 'NAME' / 'revoked.pem'} to each service and robot, beside its "
-        "certificate.pem.",
-        "Each 'holdfast serve' notices within seconds, and at once with the signal SIGHUP: links "
-        "of what is revoked end, others go on.",
+        f"An end that lacks {directory / 'authority' / 'revoked.pem'} still admits them: copy it "
+        "beside the certificate.pem of each service; if a service is revoked, of each robot too.",
+        "'holdfast serve' reads it within seconds, at SIGHUP at once (under systemd: systemctl "
+        "reload holdfast-cloud), and logs 'credentials reloaded'; their links end, others go on.",
+        f"For a new key: holdfast keys {directory} --rotate --robot NAME (or --service NAME)",
     ]
     return "\n".join(lines) + "\n"
 
@@ -144,24 +147,25 @@ def _line_of(issued: Issued) -> str:
     return ", ".join(parts)
 
 
-def _account(ring: KeyRing) -> str:
-    """Return what was made, and where it belongs."""
+def _account(ring: KeyRing, host: str = "HOST") -> str:
+    """Return what was made, and where it belongs; robots call the services at a host."""
     lines = []
     for made in ring.made:
         path = made.directory / "certificate.pem" if made.renewed else f"{made.directory}/"
         reached = f", reached at {', '.join(made.hosts)}" if made.hosts else ""
         until = made.expires.strftime("%Y-%m-%d")
-        lines.append(f"{path} for {made.role} {made.name!r}, valid until {until}{reached}")
+        lines.append(f"made: {path} for {made.role} {made.name!r}, valid until {until}{reached}")
     if any(made.renewed for made in ring.made):
         lines += [
             "",
             "Copy each certificate.pem over the old one. Services read it within "
             "seconds, and at once with the signal SIGHUP.",
         ]
+    endpoint = f"tls/{host_and_port(host, 7447)}"
     commands = [
         f"  holdfast serve --listen tls/0.0.0.0:7447 --tls {made.directory}"
         if made.role == "service"
-        else f"  holdfast run CONFIG --service tls/HOST:7447 --tls {made.directory}"
+        else f"  holdfast run CONFIG --service {endpoint} --tls {made.directory}"
         for made in ring.made
         if not made.renewed
     ]

@@ -147,7 +147,7 @@ class Dispatcher(DecisionSource):
         elif isinstance(event, ServiceAppeared):
             self._appeared(self._services.get(event.service), event.incarnation, now)
         elif isinstance(event, ServiceVanished):
-            self._vanished(self._services.get(event.service), event.incarnation, now)
+            self._vanished(event, now)
         elif isinstance(event, OwnAnswer):
             self._decided(event)
         elif isinstance(event, RecoveryExited):
@@ -223,11 +223,13 @@ class Dispatcher(DecisionSource):
             # It need not wait for the next turn: with an answer to this one it holds the state.
             self._calls.send(replica, question, now, is_retry=False)
 
-    def _vanished(self, replica: Replica | None, incarnation: str, now: float) -> None:
-        if replica is None or not replica.detector.vanished(incarnation):
+    def _vanished(self, event: ServiceVanished, now: float) -> None:
+        replica = self._services.get(event.service)
+        if replica is None or not replica.detector.vanished(event.incarnation):
             return
         self._calls.abandon_all(replica)
-        self.effects.report("service_vanished", service=replica.name)
+        why = {"reason": event.reason} if event.reason else {}
+        self.effects.report("service_vanished", service=replica.name, **why)
         if replica is self._services.local:
             self._launches.ended(now)
 
@@ -239,7 +241,7 @@ class Dispatcher(DecisionSource):
         if event.launch != launches.number or launches.pending:
             return  # It was seen to be gone before; only the reason is new.
         if local.detector.incarnation is not None:
-            self._vanished(local, local.detector.incarnation, now)
+            self._vanished(ServiceVanished(local.name, local.detector.incarnation), now)
         else:
             launches.failed(now)
 
@@ -297,6 +299,7 @@ class Dispatcher(DecisionSource):
                 f"answered otherwise than the robot's own planner in step {wrong.step}"
             )
             self._calls.abandon_all(replica)
+            self.effects.counts["wrong_answer"] += 1
             self.effects.report(
                 "wrong_answer",
                 service=replica.name,

@@ -36,8 +36,7 @@ class ObservationWarnings:
     def __init__(self, effects: Effects[RobotEffect], lost: LostSettings) -> None:
         self._effects = effects
         self._lost = lost
-        # Events of each kind in this process, also those that were counted only.
-        self.counts: Counter[str] = Counter()
+        self.counts = effects.counts
         self._trial: int | None = None
         self._reported: Counter[str] = Counter()  # in that trial
 

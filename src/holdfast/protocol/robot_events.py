@@ -11,6 +11,7 @@ sent or performed that a restarted robot would not know of.
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Generic, Literal, NamedTuple, TypeAlias, TypeVar
 
 from holdfast.errors import HoldfastError
@@ -32,6 +33,7 @@ class ServiceVanished(NamedTuple):
 
     service: str
     incarnation: str
+    reason: str = ""
 
 
 class ReplyReceived(NamedTuple):
@@ -243,6 +245,10 @@ _Effect = TypeVar("_Effect")
 
 class Effects(list[_Effect | LogEvent], Generic[_Effect]):
     """The effects of one end so far; its parts share this list, since their order counts."""
+
+    def __init__(self) -> None:
+        # Events for metrics, by kind, also those that were not reported.
+        self.counts: Counter[str] = Counter()
 
     def report(self, name: str, **fields: object) -> None:
         """Append a line of the log."""

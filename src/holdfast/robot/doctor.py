@@ -71,6 +71,13 @@ _NO_HOLDFAST: Final = "is it another program, at tls/... or udp/..., or a proces
 _DISTRUST: Final = "do not use it before you know why (docs/trust.md)"
 _OPEN_IT: Final = "let it through the firewalls on the way, or mend the VPN"
 
+_AT_SERVICE: Final = {
+    "other_code": "deploy the same holdfast and problem at both ends, and start the service again",
+    "unknown_problem": "start the service with --problem {0}; its module must be installed there, "
+    "or lie, the same as here, where the service starts or in --problem-directory DIR",
+}
+"""What to do about a refusal, with the problem's name; of other codes the text says it."""
+
 _Kind = TypeVar("_Kind")
 _Look: TypeAlias = Callable[..., Awaitable["_Seen | None"]]
 State: TypeAlias = Literal["ok", "warns", "fails", "-"]
@@ -242,6 +249,8 @@ class Examination:
             own = endpoint.is_local_socket or endpoint.is_loopback
             at = endpoint if own else f"{endpoint.protocol}/0.0.0.0:{endpoint.port}"
             advice = f"start the service there: holdfast serve --listen {at}"
+            if endpoint.is_encrypted:
+                advice += " --tls KEYS/service; 'holdfast keys KEYS' makes both ends' credentials"
             raise _LayerError(f"{what}: refused, nothing listens there", advice) from error
         except OSError as error:
             raise _LayerError(f"{what}: {system_words(error.errno)}", _OPEN_IT) from error
@@ -249,7 +258,7 @@ class Examination:
 
     def _own_credentials(self) -> _Seen:
         if self._offload.tls is None:
-            advice = "'holdfast keys DIR' makes them; give this robot's with --tls DIR"
+            advice = "give this robot's, --tls KEYS/robot; 'holdfast keys KEYS' makes both ends'"
             return _Seen("none was given", advice)
         warnings: list[str] = []
         try:
@@ -338,6 +347,8 @@ class Examination:
         except HoldfastError as error:
             raise _LayerError(f"this robot's own planner fails: {error}") from error
         session, slow = os.urandom(16), "it is too slow for this problem, or has too much to do"
+        described = own[0].request.session_configuration
+        assert described is not None
         for decision in own:
             request = msgspec.structs.replace(decision.request, session=session)
             began = time.perf_counter()
@@ -346,7 +357,7 @@ class Examination:
                     await asyncio.sleep(1e-3 * busy.retry_after_ms)
             took_s = time.perf_counter() - began
             if refused := _of_kind(Refused, replies):
-                advice = "deploy the same holdfast and problem at both ends"
+                advice = _AT_SERVICE.get(refused.code, "").format(described.problem)
                 raise _LayerError(f"{refused.code}: {refused.text}", advice)
             if answer_in(replies) != decision.answer:
                 other = "answers otherwise than this robot's own planner"
@@ -354,8 +365,6 @@ class Examination:
                     other = "comes to another state than this robot"
                 raise _LayerError(f"the service {other}, with the same code", _DISTRUST)
         self._decision_s = took_s, decision.took_s
-        described = own[0].request.session_configuration
-        assert described is not None
         seen = f"{described.problem}: the same code and settings; {len(own)} decisions are"
         return _Seen(f"{seen} the robot's own, bit for bit")
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
 _COUNTERS = (
+    ("wrong_answer", "wrong_answers", "Wrong answers; their service is asked no more in this run."),
     ("no_reading", "missing_observations", "Sensing actions that gave no reading."),
     ("unexplained", "unexplained_observations", "Observations that no particle explains."),
     ("lost", "lost", "Times that the robot was found lost."),

@@ -4,20 +4,9 @@ The code that reports an event does not know where it goes: :class:`~holdfast.ru
 writes it as a line, :class:`BoundedEventLog` passes it to several sinks and limits the rate of
 repeated ones.
 
-Events of the robot: status, launch, launched, launch_failed, recovery_exited,
-retry, hedge, restore, restored, state_diverged, service_appeared, service_vanished,
-service_suspected, unreachable, no_datagrams, insecure, credentials,
-late_replies, waiting, holding, resumed, busy, refused, malformed_reply, disagreement,
-wrong_answer, not_deterministic, verification_failed, distrusted,
-limits_unknown, verifying, prefetch_unused, unexplained, lost, sensor_suspect, reinitialised,
-late_unused, no_reading, version_changed, resumed_trial, performed_unseen, trial, missed_ticks,
-stopped, note,
-interrupted, offers.
-Of a service: ready, session_opened, session_taken_over, restored, state_diverged, refused, busy,
-evicted, robot_connected, robot_disconnected, link_refused, credentials, credentials_reloaded,
-stopping, process_ended, process_started, ros_master, ros_shutdown. Of both: defect, stuck.
-Of a command that ends with an error: error. These fields have a place of their own in the text
-form: ``from`` and ``to`` (of a change), ``service``, ``robot``, ``reason``, ``duration_ms``.
+docs/status.md has tables of a robot's events, and docs/operations.md one of a service's. These
+fields have a place of their own in the text form: ``from`` and ``to`` (of a change), ``service``,
+``robot``, ``reason``, ``duration_ms``.
 """
 
 from __future__ import annotations
@@ -36,25 +25,10 @@ _BURST = 20
 
 _WARNINGS = frozenset(
     [
-        "launch_failed",
-        "recovery_exited",
-        "service_vanished",
-        "service_suspected",
-        "unreachable",
-        "holding",
-        "unexplained",
-        "no_reading",
-        "lost",
-        "sensor_suspect",
-        "reinitialised",
-        "malformed_reply",
-        "disagreement",
-        "refused",
-        "verification_failed",
-        "distrusted",
-        "missed_ticks",
-        "performed_unseen",
-        "insecure",
+        *("launch_failed", "recovery_exited", "service_vanished", "service_suspected", "refused"),
+        *("unreachable", "insecure", "malformed_reply", "holding", "missed_ticks"),
+        *("disagreement", "verification_failed", "distrusted", "performed_unseen"),
+        *("unexplained", "no_reading", "lost", "sensor_suspect", "reinitialised"),
     ]
 )
 _ERRORS = frozenset(

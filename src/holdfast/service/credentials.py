@@ -9,6 +9,7 @@ they are gone altogether, no new robot should come.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -83,7 +84,7 @@ class ServiceCredentials:
         except HoldfastError as error:
             failure = f"{error}; the previous ones stay in use"
             if requested or failure != self._failure:
-                events.event("credentials", reason=failure)
+                events.event("credentials", reason=failure, pid=os.getpid())
             self._failure = failure
             self._gone = str(error) if isinstance(error, CredentialsGoneError) else None
             return
@@ -96,4 +97,5 @@ class ServiceCredentials:
             links_ended=ended,
             valid_until=date_text(read.expires_s),
             num_revoked=transport.num_revoked,
+            pid=os.getpid(),
         )

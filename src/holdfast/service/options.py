@@ -211,8 +211,8 @@ def checked_endpoints(options: ServeOptions) -> list[Endpoint]:
         if not (endpoint.is_loopback or options.insecure or endpoint.is_encrypted):
             raise TransportError(
                 f"--listen: endpoint {endpoint}: other machines can reach it, and no peer "
-                f"proves its identity; use tls/... or udp/... with --tls DIR ('holdfast "
-                f"keys DIR' makes the credentials), an address of this machine alone, as in "
+                f"proves its identity; use tls/... or udp/... with --tls KEYS/service "
+                f"('holdfast keys KEYS' makes it), an address of this machine alone, as in "
                 f"tcp/{_DEFAULT_PLACE}, or say --insecure"
             )
         listen.append(endpoint)

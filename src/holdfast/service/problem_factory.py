@@ -103,8 +103,6 @@ class ProblemFactory:
             with contextlib.suppress(UnknownProblemError):
                 return registry.problem_class(name)
         known = ", ".join(sorted({*self._names, *self._classes}))
-        hint = "; a class in a file must be named when the service is started (--problem)"
-        raise UnknownProblemError(
-            f"problem {name}: is not known to this service{hint if ':' in name else ''}; known are "
-            f"{known}"
-        )
+        hint = f"; it must be started with --problem {name}, since this is a class in a file"
+        text = f"problem {name}: is not known to this service{hint if ':' in name else ''}"
+        raise UnknownProblemError(f"{text}; known are {known}")

@@ -85,6 +85,8 @@ class _Child:
         # Counted by the supervisor's timer: what stops this process, too, does not count.
         self.silent_s = 0
         self.report: ServiceReport | None = None
+        # Why it cannot serve, or was killed.
+        self.failure: str | None = None
 
     def trouble(self) -> str | None:
         """Return what is wrong with it, if anything."""
@@ -96,6 +98,10 @@ class _Child:
         """Count a second without a report; kill one that its own watchdog has failed to end."""
         self.silent_s += 1
         if self.report is not None and self.silent_s > watchdog_s + _KILL_S:
+            self.failure = (
+                f"said nothing for {self.silent_s} s, so the supervisor killed it; the limit is "
+                f"--watchdog-s, {watchdog_s:g} s, and {_KILL_S} s more"
+            )
             self.process.kill()
 
 
@@ -275,12 +281,11 @@ class Supervisor:
 
     async def _until_it_ends(self, child: _Child, control: socket.socket) -> str:
         """Take a process's reports until it ends; return how it ended."""
-        failure = None
         while data := await self._loop.sock_recv(control, _MAX_MESSAGE_BYTES):
             message = msgspec.msgpack.decode(data, type=ServiceReport | str)
             child.silent_s = 0
             if isinstance(message, str):
-                failure = message
+                child.failure = message
                 continue
             if child.report is None and self._serving.done():
                 started_ms = round((monotonic() - child.started_at) * 1000)
@@ -295,7 +300,7 @@ class Supervisor:
         self._living.remove(child)
         if child.report is not None:
             self._past = summed([self._past, child.report.without_gauges()])
-        return failure or how_it_ended(code)
+        return child.failure or how_it_ended(code)
 
 
 async def _first_of(*futures: asyncio.Future[Any]) -> None:

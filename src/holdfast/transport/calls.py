@@ -79,10 +79,10 @@ class CallTable:
         if self._deliver is not None:
             self._deliver(ServiceAppeared(service, incarnation))
 
-    def vanished(self, service: str, incarnation: str, peer: object) -> None:
+    def vanished(self, service: str, incarnation: str, peer: object, reason: str = "") -> None:
         """Deliver that a service has vanished, then the ends of its calls."""
         if self._deliver is not None:
-            self._deliver(ServiceVanished(service, incarnation))
+            self._deliver(ServiceVanished(service, incarnation, reason))
             self.peer_lost(peer)
 
     def peer_lost(self, peer: object) -> None:

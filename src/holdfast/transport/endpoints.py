@@ -229,8 +229,8 @@ def check_credentials(endpoint: Endpoint, tls: TlsFiles | None) -> None:
     """
     if endpoint.is_encrypted and tls is None:
         raise TransportError(
-            f"endpoint {endpoint}: {endpoint.protocol} needs credentials (--tls DIR; "
-            f"'holdfast keys DIR' makes them)"
+            f"endpoint {endpoint}: {endpoint.protocol} needs credentials (--tls KEYS/NAME; "
+            f"'holdfast keys KEYS' makes them)"
         )
     if tls is not None and not endpoint.is_encrypted and not endpoint.is_local_socket:
         raise TransportError(

@@ -327,7 +327,9 @@ def _check_arguments(
             raise CredentialsError(f"name {name!r}: stands twice; each needs a directory")
     if hosts and not services:
         raise CredentialsError(
-            f"host {hosts[0]!r}: only services are called by a host, and none is made"
+            f"host {hosts[0]!r}: stands in services' certificates, and only robots are to be made; "
+            f"name the service too (--service NAME; with --renew one that exists), or leave the "
+            f"host out"
         )
     for host in hosts:
         if not is_host(host):

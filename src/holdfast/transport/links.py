@@ -70,6 +70,9 @@ _PING: Final = encode_frame(PING)
 
 _NO_TLS: Final = "does not speak TLS; as at that end, write tls/... or udp/... with --tls DIR"
 _EXPIRED: Final = "has a certificate that has expired"
+_NO_GOODBYE: Final = (
+    "closed the connection without a goodbye: was killed, or heard nothing from here"
+)
 
 
 class LinkOwner(ABC):
@@ -190,6 +193,11 @@ class Link(asyncio.BufferedProtocol):
     def ended(self) -> bool:
         """Whether nothing can be sent any more."""
         return self._ended
+
+    @property
+    def why_ended(self) -> str:
+        """Why the link has ended, as the rest of a sentence about the other end."""
+        return self.reason or ("said goodbye" if self.said_goodbye else _NO_GOODBYE)
 
     @property
     def owner(self) -> object:

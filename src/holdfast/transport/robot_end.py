@@ -432,7 +432,7 @@ class _ServiceLinks(LinkOwner):
         if incarnation is not None and incarnation in self._links.values():
             self._robot.calls.peer_lost(link)  # another link to the same process remains
         elif incarnation is not None:
-            self._robot.calls.vanished(self._name, incarnation, link)
+            self._robot.calls.vanished(self._name, incarnation, link, link.why_ended)
             older = next(reversed(self._links), None)
             if older is not None and was_current:
                 # An older link is open; from now on it is the current one.

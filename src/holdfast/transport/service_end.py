@@ -58,8 +58,6 @@ MAX_LINKS: Final = 4096
 MAX_UNSENT_BYTES: Final = 32 << 20
 """Bound on all replies together that wait until robots read: the largest has 2 MiB."""
 
-_SAID_GOODBYE: Final = "said goodbye"
-_NO_GOODBYE: Final = "closed the connection without a goodbye, as one that is killed does"
 _SERVICE_ENDS: Final = "this service ends"
 _REVOKED: Final = "has a certificate that has been revoked"
 _FOREIGN: Final = "has a certificate of an authority that is no longer trusted"
@@ -409,9 +407,8 @@ class StreamServiceTransport(LinkOwner):
             if call.on_gone is not None:
                 call.on_gone()
         if calls is not None and link.hello is not None:
-            reason = link.reason or (_SAID_GOODBYE if link.said_goodbye else _NO_GOODBYE)
-            robot = _name(link, link.hello)
-            self._on_event("robot_disconnected", robot=robot, reason=reason, address=link.address)
+            robot, why = _name(link, link.hello), link.why_ended
+            self._on_event("robot_disconnected", robot=robot, reason=why, address=link.address)
         elif link.reason:
             fields = {"robot": link.peer.name} if link.peer is not None else {}
             self._on_event("link_refused", reason=link.reason, address=link.address, **fields)
