@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <bit>
 #include <limits>
+#include <memory>
+#include <numeric>
 #include <utility>
 #include <vector>
 
@@ -21,26 +23,27 @@ constexpr double cost_of_sums = 40.0;
 // Gains that are kept at once: 16 MB.
 constexpr std::size_t most_gains = std::size_t{1} << 21;
 
-/// Eight doubles in one line of the cache.
-struct alignas(64) Line {
-    double values[lane_count];
-};
-
-/// Doubles that begin with a line of the cache.
+/// Doubles that begin with a line of the cache, and are not set at first: between two rounds of
+/// work the helpers wait, and the numbers are many.
 class Lined {
   public:
-    explicit Lined(std::size_t count = 0, double value = 0.0) { resize(count, value); }
-    void resize(std::size_t count, double value = 0.0) {
-        Line line;
-        std::fill_n(line.values, lane_count, value);
-        lines_.resize((count + lane_count - 1) / lane_count, line);
+    explicit Lined(std::size_t count = 0) { resize(count); }
+    /// Makes room; what was there is gone if it is more than ever before.
+    void resize(std::size_t count) {
+        if (count <= room_) return;
+        room_ = count;
+        lines_ = std::make_unique_for_overwrite<Line[]>((count + lane_count - 1) / lane_count);
     }
-    double* data() { return lines_.data()->values; }
-    const double* data() const { return lines_.data()->values; }
+    double* data() { return lines_[0].values; }
+    const double* data() const { return lines_[0].values; }
     double& operator[](std::size_t i) { return data()[i]; }
 
   private:
-    std::vector<Line> lines_;
+    struct alignas(64) Line {
+        double values[lane_count];
+    };
+    std::size_t room_ = 0;
+    std::unique_ptr<Line[]> lines_;
 };
 
 /// The points of positive prior weight of one set, coordinate by coordinate, without those that are
@@ -52,7 +55,7 @@ struct Coordinates {
 
     Coordinates(const PointSets& sets, std::size_t set, const std::vector<std::uint32_t>& present,
                 std::size_t stride)
-        : values(sets.dimension * stride, infinity) {
+        : values(sets.dimension * stride) {
         const double* points = sets.points + set * sets.count * sets.dimension;
         for (std::size_t c = 0; c < sets.dimension; ++c) {
             double* const own = values.data() + varying * stride;
@@ -61,6 +64,7 @@ struct Coordinates {
                 own[i] = points[present[i] * sets.dimension + c];
                 varies |= own[i] != own[0];
             }
+            std::fill(own + present.size(), own + stride, infinity);
             varying += varies ? 1 : 0;
         }
         bring_together_equals(present.size(), stride);
@@ -73,13 +77,18 @@ struct Coordinates {
 /// By a table of hashes, in which each point finds the first one that is equal to it.
 void Coordinates::bring_together_equals(std::size_t size, std::size_t stride) {
     constexpr std::uint32_t nobody = 0xffffffffu;
-    std::size_t slots = 16;
+    constexpr std::size_t few = 128;  // their sums take less time than the search
+    order.resize(size);
+    std::iota(order.begin(), order.end(), 0u);
+    if (size <= few) return;
+    std::size_t slots = 2 * few;
     while (slots < 2 * size) slots *= 2;
     std::vector<std::uint32_t> table(slots, nobody), class_of(size), first_of, begins;
     for (std::uint32_t n = 0; n < size; ++n) {
         std::uint64_t hash = 0;
         for (std::size_t c = 0; c < varying; ++c) {
-            const auto bits = std::bit_cast<std::uint64_t>(values.data()[c * stride + n]);
+            // Of -0 the bits of 0, to which it is equal.
+            const auto bits = std::bit_cast<std::uint64_t>(values.data()[c * stride + n] + 0.0);
             hash = (hash ^ bits) * 0x9e3779b97f4a7c15u;
             hash ^= hash >> 32;
         }
@@ -104,7 +113,6 @@ void Coordinates::bring_together_equals(std::size_t size, std::size_t stride) {
     }
     std::uint32_t begin = 0;
     for (std::uint32_t& each : begins) begin += std::exchange(each, begin);
-    order.resize(size);
     for (std::uint32_t n = 0; n < size; ++n) order[begins[class_of[n]]++] = n;
 }
 
@@ -113,10 +121,12 @@ Lined rows_of(const std::vector<std::uint32_t>& present, const double* prior, co
               std::size_t count, std::size_t number, std::size_t vectors) {
     const std::size_t size = present.size();
     Lined rows(size * vectors * lane_count);
-    for (std::size_t column = 0; column <= number; ++column) {
+    for (std::size_t column = 0; column < vectors * lane_count; ++column) {
         const double* const own = column == 0 ? prior : weights + (column - 1) * count;
         double* const to = &rows[column / lane_count * size * lane_count + column % lane_count];
-        for (std::size_t i = 0; i < size; ++i) to[i * lane_count] = own[present[i]];
+        for (std::size_t i = 0; i < size; ++i) {
+            to[i * lane_count] = column <= number ? own[present[i]] : 0.0;
+        }
     }
     return rows;
 }
@@ -163,8 +173,8 @@ void prior_entropies(const PointSets& sets, const double* weights, std::size_t n
                 numbers.resize(prior_block_size * (stride + 2 * lane_count));
                 vector_kernels().prior_block(
                     {size, stride, sets.dimension, coordinates[h].varying,
-                     coordinates[h].values.data(), coordinates[h].order.data(), vectors, rows.data(), k,
-                     constants},
+                     coordinates[h].values.data(), coordinates[h].order.data(), vectors,
+                     rows.data(), k, constants},
                     begin, std::min(begin + prior_block_size, size), scratch.data(), numbers.data(),
                     &terms[h * size], &gains[h * size * columns]);
             });

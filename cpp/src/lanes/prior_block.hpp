@@ -1,9 +1,13 @@
 // Neighbourhoods of the prior, and what posteriors gain in them (one compilation per instruction
 // set).
 //
-// A point's neighbours are found and used while they are in the cache: distances to all points,
-// eight at a time; then the sums over the neighbours, for a row of posteriors at once. Sums take
-// the neighbours in the order of their numbers, so the bits depend on no block and no vector.
+// The neighbours of a block of points are found first: distances to all points, eight at a time.
+// Then come the sums over them, for eight posteriors at once, whose weights stay in the cache, and
+// for several points, so that no addition waits for the one before. Sums take the neighbours in the
+// order of their numbers, so the bits depend on no block and no vector.
+//
+// Where a policy gives few actions, many points are equal. They have one ball, which is found once,
+// and their sums differ by the point itself alone: up to there they are the same.
 
 #pragma once
 
@@ -247,8 +251,8 @@ static Lanes prior_terms(const PriorGroup& group, const Lanes& prior, const Lane
     const Lanes rest = 1.0 - prior;
     const Lanes share = select(mass < rest, mass / rest, splat(1.0));
     const double half = 0.5 * static_cast<double>(group.dimension);
-    return prior *
-           (-log_of(share) + constants.log_ball_volume + half * log_of(radius_squared) + correction);
+    return prior * (-log_of(share) + constants.log_ball_volume + half * log_of(radius_squared) +
+                    correction);
 }
 
 /// What is known of the points of a block, place by place.
@@ -258,7 +262,7 @@ struct PriorPlaces {
     const std::uint32_t* numbers[prior_block_size];  // of its neighbours; of equal points the ball
     std::size_t own[prior_block_size];               // of equal points, the place in the ball
     std::size_t end_of_equals[prior_block_size];     // where the points end that are equal to it
-    Lanes priors[prior_block_size / lane_count], masses[prior_block_size / lane_count];
+    Lanes priors[prior_block_size / lane_count] = {}, masses[prior_block_size / lane_count] = {};
     double inverse_masses[prior_block_size];
 };
 
@@ -293,8 +297,8 @@ static void find_neighborhoods(const PriorGroup& group, std::size_t count, doubl
         begins[used] = first;
         Neighborhood found[lane_count];
         neighborhoods_of(group, firsts, used,
-                         {doubles, doubles + stride, kept + lane_count * group.neighbors, rows, kept,
-                          numbers, numbers_each},
+                         {doubles, doubles + stride, kept + lane_count * group.neighbors, rows,
+                          kept, numbers, numbers_each},
                          found);
         for (std::size_t i = 0; i < used; ++i) {
             std::uint32_t* const own = numbers + i * numbers_each;
@@ -386,7 +390,8 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
             }
         }
         for (std::size_t first = 0; first < single; first += sums_together) {
-            const std::size_t here = single - first < sums_together ? single - first : sums_together;
+            const std::size_t here =
+                single - first < sums_together ? single - first : sums_together;
             const std::uint32_t* numbers[sums_together];
             std::size_t members[sums_together];
             for (std::size_t i = 0; i < here; ++i) {
