@@ -29,6 +29,7 @@ constexpr std::size_t compact_limit = 24;
 // Of all points: below it the lists of near points hold too few of a posterior.
 constexpr double grouped_share = 0.12;
 constexpr double grouped_cost_of_a_point = 1000.0;
+constexpr double cost_of_making = 80.0;  // the tree and the group, of it
 // Points of a tree up to which its leaves are taken one by one, and beyond which in blocks: faster
 // where the points are dense, but sums are rounded otherwise, so this number may change bits.
 std::atomic<std::size_t> by_leaves_up_to{16384};
@@ -366,30 +367,7 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
                                                        : values[i] + settings.offset;
             }
         }
-        const std::size_t pieces = sets.number * alone.size();
-        parallel_for(
-            pieces,
-            threads_for(static_cast<double>(sets.number) * work_alone, pieces, settings.threads),
-            [&](std::size_t piece) {
-                const std::size_t set = piece / alone.size();
-                const std::size_t i = alone[piece % alone.size()];
-                const std::size_t at = set * number + i;
-                const Task& task = tasks[set];
-                const double* w = &weights[i * count];
-                if (variance) {
-                    values[at] = total_variance(task, w);
-                    visits[at] = count;
-                } else if (survivors[i] <= compact_limit) {
-                    values[at] =
-                        settings.offset + compact_entropy(task, w, survivors[i], visits[at]);
-                } else {
-                    values[at] =
-                        settings.offset + own_tree_entropy(task, w, survivors[i], visits[at]);
-                }
-            });
-        for (const std::uint64_t v : visits) counts.visits += v;
-
-        for (std::size_t begin = 0; begin < grouped.size(); begin += max_group_lanes) {
+        const auto make_group = [&](std::size_t begin, std::size_t set) {
             const std::size_t end = std::min(begin + max_group_lanes, grouped.size());
             std::vector<const double*> members;
             std::vector<std::size_t> sizes;
@@ -397,28 +375,67 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
                 members.push_back(&weights[grouped[g] * count]);
                 sizes.push_back(survivors[grouped[g]]);
             }
+            const Task& task = tasks[set];
+            if (!trees[set]) {
+                trees[set] = std::make_unique<PointTree>(task.points, count, task.dimension);
+            }
+            return std::make_unique<Group>(task, *trees[set], members, sizes);
+        };
+        // The first groups are made while other threads work on posteriors alone.
+        std::vector<std::unique_ptr<Group>> shared_groups(
+            grouped.empty() ? 0 : std::min(together, sets.number));
+        const std::size_t to_make = shared_groups.size();
+        const std::size_t pieces = to_make + sets.number * alone.size();
+        const double work_before =
+            static_cast<double>(sets.number) * work_alone +
+            cost_of_making * static_cast<double>(to_make) * static_cast<double>(count);
+        parallel_for(pieces, threads_for(work_before, pieces, settings.threads),
+                     [&](std::size_t task_number) {
+                         if (task_number < to_make) {
+                             shared_groups[task_number] = make_group(0, task_number);
+                             return;
+                         }
+                         const std::size_t piece = task_number - to_make;
+                         const std::size_t set = piece / alone.size();
+                         const std::size_t i = alone[piece % alone.size()];
+                         const std::size_t at = set * number + i;
+                         const Task& task = tasks[set];
+                         const double* w = &weights[i * count];
+                         if (variance) {
+                             values[at] = total_variance(task, w);
+                             visits[at] = count;
+                         } else if (survivors[i] <= compact_limit) {
+                             values[at] = settings.offset +
+                                          compact_entropy(task, w, survivors[i], visits[at]);
+                         } else {
+                             values[at] = settings.offset +
+                                          own_tree_entropy(task, w, survivors[i], visits[at]);
+                         }
+                     });
+        for (const std::uint64_t v : visits) counts.visits += v;
+
+        for (std::size_t begin = 0; begin < grouped.size(); begin += max_group_lanes) {
+            const std::size_t end = std::min(begin + max_group_lanes, grouped.size());
             for (std::size_t from = 0; from < sets.number; from += together) {
                 const std::size_t here = std::min(together, sets.number - from);
                 const double work = grouped_cost_of_a_point * static_cast<double>(here) *
                                     static_cast<double>(count);
-                std::vector<std::unique_ptr<Group>> shared(here);
-                parallel_for(here, threads_for(work, here, settings.threads), [&](std::size_t h) {
-                    std::unique_ptr<PointTree>& tree = trees[from + h];
-                    const Task& task = tasks[from + h];
-                    if (!tree) {
-                        tree = std::make_unique<PointTree>(task.points, count, task.dimension);
-                    }
-                    shared[h] = std::make_unique<Group>(task, *tree, members, sizes);
-                });
-                const std::size_t pieces = shared[0]->pieces();
-                parallel_for(
-                    here * pieces, threads_for(work, here * pieces, settings.threads),
-                    [&](std::size_t piece) { shared[piece / pieces]->add_piece(piece % pieces); });
+                if (begin > 0 || from > 0) {
+                    shared_groups.resize(here);
+                    parallel_for(
+                        here, threads_for(work, here, settings.threads),
+                        [&](std::size_t h) { shared_groups[h] = make_group(begin, from + h); });
+                }
+                const std::size_t pieces = shared_groups[0]->pieces();
+                parallel_for(here * pieces, threads_for(work, here * pieces, settings.threads),
+                             [&](std::size_t piece) {
+                                 shared_groups[piece / pieces]->add_piece(piece % pieces);
+                             });
                 for (std::size_t h = 0; h < here; ++h) {
-                    counts.visits += shared[h]->visits();
+                    counts.visits += shared_groups[h]->visits();
                     for (std::size_t g = begin; g < end; ++g) {
                         values[(from + h) * number + grouped[g]] =
-                            settings.offset + shared[h]->entropy(g - begin);
+                            settings.offset + shared_groups[h]->entropy(g - begin);
                     }
                 }
             }

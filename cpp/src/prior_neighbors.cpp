@@ -1,7 +1,11 @@
 #include "prior_neighbors.hpp"
 
 #include <algorithm>
+#include <bit>
 #include <limits>
+#include <memory>
+#include <numeric>
+#include <utility>
 #include <vector>
 
 #include "deterministic_math.hpp"
@@ -12,7 +16,6 @@ namespace holdfast {
 namespace {
 
 constexpr double infinity = std::numeric_limits<double>::infinity();
-constexpr std::size_t block_size = 16;
 // Nanoseconds for a distance with its part in the choice of the nearest, and for the sums of a
 // point and eight posteriors.
 constexpr double cost_of_a_pair = 0.6;
@@ -20,26 +23,27 @@ constexpr double cost_of_sums = 40.0;
 // Gains that are kept at once: 16 MB.
 constexpr std::size_t most_gains = std::size_t{1} << 21;
 
-/// Eight doubles in one line of the cache.
-struct alignas(64) Line {
-    double values[lane_count];
-};
-
-/// Doubles that begin with a line of the cache.
+/// Doubles that begin with a line of the cache, and are not set at first: between two rounds of
+/// work the helpers wait, and the numbers are many.
 class Lined {
   public:
-    explicit Lined(std::size_t count = 0, double value = 0.0) { resize(count, value); }
-    void resize(std::size_t count, double value = 0.0) {
-        Line line;
-        std::fill_n(line.values, lane_count, value);
-        lines_.resize((count + lane_count - 1) / lane_count, line);
+    explicit Lined(std::size_t count = 0) { resize(count); }
+    /// Makes room; what was there is gone if it is more than ever before.
+    void resize(std::size_t count) {
+        if (count <= room_) return;
+        room_ = count;
+        lines_ = std::make_unique_for_overwrite<Line[]>((count + lane_count - 1) / lane_count);
     }
-    double* data() { return lines_.data()->values; }
-    const double* data() const { return lines_.data()->values; }
+    double* data() { return lines_[0].values; }
+    const double* data() const { return lines_[0].values; }
     double& operator[](std::size_t i) { return data()[i]; }
 
   private:
-    std::vector<Line> lines_;
+    struct alignas(64) Line {
+        double values[lane_count];
+    };
+    std::size_t room_ = 0;
+    std::unique_ptr<Line[]> lines_;
 };
 
 /// The points of positive prior weight of one set, coordinate by coordinate, without those that are
@@ -47,10 +51,11 @@ class Lined {
 struct Coordinates {
     std::size_t varying = 0;
     Lined values;
+    std::vector<std::uint32_t> order;  // equal points beside each other, in the order of numbers
 
     Coordinates(const PointSets& sets, std::size_t set, const std::vector<std::uint32_t>& present,
                 std::size_t stride)
-        : values(sets.dimension * stride, infinity) {
+        : values(sets.dimension * stride) {
         const double* points = sets.points + set * sets.count * sets.dimension;
         for (std::size_t c = 0; c < sets.dimension; ++c) {
             double* const own = values.data() + varying * stride;
@@ -59,21 +64,68 @@ struct Coordinates {
                 own[i] = points[present[i] * sets.dimension + c];
                 varies |= own[i] != own[0];
             }
+            std::fill(own + present.size(), own + stride, infinity);
             varying += varies ? 1 : 0;
         }
+        bring_together_equals(present.size(), stride);
     }
+
+  private:
+    void bring_together_equals(std::size_t size, std::size_t stride);
 };
 
-/// Point by point, the prior and the posteriors beside each other.
+/// By a table of hashes, in which each point finds the first one that is equal to it.
+void Coordinates::bring_together_equals(std::size_t size, std::size_t stride) {
+    constexpr std::uint32_t nobody = 0xffffffffu;
+    constexpr std::size_t few = 128;  // their sums take less time than the search
+    order.resize(size);
+    std::iota(order.begin(), order.end(), 0u);
+    if (size <= few) return;
+    std::size_t slots = 2 * few;
+    while (slots < 2 * size) slots *= 2;
+    std::vector<std::uint32_t> table(slots, nobody), class_of(size), first_of, begins;
+    for (std::uint32_t n = 0; n < size; ++n) {
+        std::uint64_t hash = 0;
+        for (std::size_t c = 0; c < varying; ++c) {
+            // Of -0 the bits of 0, to which it is equal.
+            const auto bits = std::bit_cast<std::uint64_t>(values.data()[c * stride + n] + 0.0);
+            hash = (hash ^ bits) * 0x9e3779b97f4a7c15u;
+            hash ^= hash >> 32;
+        }
+        std::size_t slot = hash & (slots - 1);
+        const auto is_equal = [&](std::uint32_t other) {
+            for (std::size_t c = 0; c < varying; ++c) {
+                const double* const column = values.data() + c * stride;
+                if (column[n] != column[other]) return false;
+            }
+            return true;
+        };
+        while (table[slot] != nobody && !is_equal(first_of[table[slot]])) {
+            slot = (slot + 1) & (slots - 1);
+        }
+        if (table[slot] == nobody) {
+            table[slot] = static_cast<std::uint32_t>(first_of.size());
+            first_of.push_back(n);
+            begins.push_back(0);
+        }
+        class_of[n] = table[slot];
+        ++begins[class_of[n]];
+    }
+    std::uint32_t begin = 0;
+    for (std::uint32_t& each : begins) begin += std::exchange(each, begin);
+    for (std::uint32_t n = 0; n < size; ++n) order[begins[class_of[n]]++] = n;
+}
+
+/// Eight after eight, the prior and the posteriors beside each other, point by point.
 Lined rows_of(const std::vector<std::uint32_t>& present, const double* prior, const double* weights,
-              std::size_t count, std::size_t number, std::size_t columns) {
-    Lined rows(present.size() * columns);
-    for (std::size_t first = 0; first < present.size(); first += block_size) {
-        const std::size_t end = std::min(first + block_size, present.size());
-        for (std::size_t i = first; i < end; ++i) rows[i * columns] = prior[present[i]];
-        for (std::size_t p = 0; p < number; ++p) {
-            const double* own = weights + p * count;
-            for (std::size_t i = first; i < end; ++i) rows[i * columns + 1 + p] = own[present[i]];
+              std::size_t count, std::size_t number, std::size_t vectors) {
+    const std::size_t size = present.size();
+    Lined rows(size * vectors * lane_count);
+    for (std::size_t column = 0; column < vectors * lane_count; ++column) {
+        const double* const own = column == 0 ? prior : weights + (column - 1) * count;
+        double* const to = &rows[column / lane_count * size * lane_count + column % lane_count];
+        for (std::size_t i = 0; i < size; ++i) {
+            to[i * lane_count] = column <= number ? own[present[i]] : 0.0;
         }
     }
     return rows;
@@ -90,7 +142,7 @@ void prior_entropies(const PointSets& sets, const double* weights, std::size_t n
     }
     const std::size_t size = present.size();
     const std::size_t stride = (size + lane_count - 1) / lane_count * lane_count;
-    const std::size_t blocks = (size + block_size - 1) / block_size;
+    const std::size_t blocks = (size + prior_block_size - 1) / prior_block_size;
     const auto k = static_cast<std::uint32_t>(std::min<std::size_t>(settings.neighbors, size - 1));
     // As many posteriors at a time as one set allows, then as many sets.
     const std::size_t most = std::max<std::size_t>(lane_count, most_gains / size) - 1;
@@ -99,7 +151,7 @@ void prior_entropies(const PointSets& sets, const double* weights, std::size_t n
         const std::size_t vectors = (1 + here + lane_count - 1) / lane_count;
         const std::size_t columns = vectors * lane_count;
         const double* own = weights + first * sets.count;
-        const Lined rows = rows_of(present, settings.prior, own, sets.count, here, columns);
+        const Lined rows = rows_of(present, settings.prior, own, sets.count, here, vectors);
         const std::size_t together =
             std::clamp<std::size_t>(most_gains / (size * columns), 1, sets.number);
         Lined gains(together * size * columns), terms(together * size);
@@ -114,15 +166,16 @@ void prior_entropies(const PointSets& sets, const double* weights, std::size_t n
                                                        cost_of_sums * static_cast<double>(vectors));
             const std::size_t pieces = of_sets * blocks;
             parallel_for(pieces, threads_for(work, pieces, settings.threads), [&](std::size_t i) {
-                const std::size_t h = i / blocks, begin = i % blocks * block_size;
+                const std::size_t h = i / blocks, begin = i % blocks * prior_block_size;
                 thread_local Lined scratch;
                 thread_local std::vector<std::uint32_t> numbers;
                 scratch.resize(10 * stride + 9 * k);
-                numbers.resize(lane_count * (stride + 2 * lane_count));
+                numbers.resize(prior_block_size * (stride + 2 * lane_count));
                 vector_kernels().prior_block(
                     {size, stride, sets.dimension, coordinates[h].varying,
-                     coordinates[h].values.data(), vectors, rows.data(), k, constants},
-                    begin, std::min(begin + block_size, size), scratch.data(), numbers.data(),
+                     coordinates[h].values.data(), coordinates[h].order.data(), vectors,
+                     rows.data(), k, constants},
+                    begin, std::min(begin + prior_block_size, size), scratch.data(), numbers.data(),
                     &terms[h * size], &gains[h * size * columns]);
             });
             for (std::size_t h = 0; h < of_sets; ++h) {

@@ -63,16 +63,20 @@ struct CompactPosterior {
     double* scratch;  // [stride + the k of the nearest neighbours][8]
 };
 
+/// Points of a prior that are worked on together.
+inline constexpr std::size_t prior_block_size = 32;
+
 /// Points of a prior and posteriors over them, side by side (prior_neighbors.hpp).
 struct PriorGroup {
     std::size_t count;   // points of positive prior weight
     std::size_t stride;  // a multiple of 8
     std::size_t dimension;
-    std::size_t varying;        // coordinates that are not the same in all points, or one
-    const double* coordinates;  // [varying][stride], +infinity beyond count
-    std::size_t vectors;        // Lanes in a row
-    const double* weights;      // [count][vectors * 8]: in column 0 of the prior
-    std::uint32_t neighbors;    // the k, 0 if there is one point
+    std::size_t varying;         // coordinates that are not the same in all points, or one
+    const double* coordinates;   // [varying][stride], +infinity beyond count
+    const std::uint32_t* order;  // [count] the points, equal ones beside each other
+    std::size_t vectors;         // Lanes in a row
+    const double* weights;       // [vectors][count][8]: of the prior, then of the posteriors
+    std::uint32_t neighbors;     // the k, 0 if there is one point
     NearestNeighborConstants constants;
 };
 

@@ -1,7 +1,7 @@
 """The estimate with the prior's neighbourhoods: against a plain one, and what it is there for.
 
-The kernel takes the prior and its posteriors eight at a time, up to four such rows at once, and
-points in blocks of eight; the counts lie around these.
+The kernel takes the prior and its posteriors eight at a time, points in blocks of 32, and from 129
+points on those that are equal together; the counts lie around these.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ def posteriors_of(rng: np.random.Generator, prior: FloatArray, number: int) -> F
         (17, 6, 9, 5, 0.5),
         (100, 3, 30, 5, 0.1),
         (130, 2, 17, 40, 10.0),
+        (180, 2, 17, 5, 0.1),
         (65, 1, 40, 9, 1e-2),
     ],
 )

@@ -113,8 +113,9 @@ for count, dimension, kept, posteriors, way in (
     result, *_ = kernel.entropies(points, normals, True, 2, 1, 1.0, 0.0, 0.0, 2, *alone)
     note(f"variance {count} {dimension} {kept}", result)
     prior = np.full(count, 1.0 / count)
-    result, *_ = kernel.entropies(points, normals, True, 3, 5, 0.1, 0.0, 0.0, 2, (1.0,), prior)
-    note(f"prior neighbours {count} {dimension} {kept}", result)
+    for name, own in (("spread", points), ("few", np.round(points))):
+        result, *_ = kernel.entropies(own, normals, True, 3, 5, 0.1, 0.0, 0.0, 2, (1.0,), prior)
+        note(f"prior neighbours {count} {dimension} {kept} {name}", result)
 
 for count in (5, 100, 1001):
     draw = stream.substream(count)

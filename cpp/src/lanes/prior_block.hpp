@@ -1,9 +1,13 @@
 // Neighbourhoods of the prior, and what posteriors gain in them (one compilation per instruction
 // set).
 //
-// A point's neighbours are found and used while they are in the cache: distances to all points,
-// eight at a time; then the sums over the neighbours, for a row of posteriors at once. Sums take
-// the neighbours in the order of their numbers, so the bits depend on no block and no vector.
+// The neighbours of a block of points are found first: distances to all points, eight at a time.
+// Then come the sums over them, for eight posteriors at once, whose weights stay in the cache, and
+// for several points, so that no addition waits for the one before. Sums take the neighbours in the
+// order of their numbers, so the bits depend on no block and no vector.
+//
+// Where a policy gives few actions, many points are equal. They have one ball, which is found once,
+// and their sums differ by the point itself alone: up to there they are the same.
 
 #pragma once
 
@@ -116,8 +120,8 @@ struct PriorScratch {
     std::size_t numbers_each;
 };
 
-/// Writes the numbers of the neighbours of eight points or fewer, from point `base` on.
-static void neighborhoods_of(const PriorGroup& group, std::size_t base, std::size_t used,
+/// Writes the numbers of the neighbours of eight points or fewer.
+static void neighborhoods_of(const PriorGroup& group, const std::uint32_t* points, std::size_t used,
                              const PriorScratch& scratch, Neighborhood* around) {
     const double resolution_squared = group.constants.resolution * group.constants.resolution;
     const double resolved_above = resolution_squared * tie_tolerance;
@@ -127,7 +131,7 @@ static void neighborhoods_of(const PriorGroup& group, std::size_t base, std::siz
     const std::size_t parts = (k + lane_count - 1) / lane_count;
     std::size_t candidates[lane_count] = {}, most = 0;
     for (std::size_t i = 0; i < used; ++i) {
-        const std::size_t n = base + i;
+        const std::size_t n = points[i];
         std::uint32_t* const numbers = scratch.numbers + i * scratch.numbers_each;
         scratch.first[n] = __builtin_inf();  // a point is no neighbour of its own
         std::uint32_t kept = 0, within = 0;
@@ -186,22 +190,57 @@ static void neighborhoods_of(const PriorGroup& group, std::size_t base, std::siz
     }
 }
 
-/// sums[i] = the sum over the numbers, in their order, of the row's vector that begins at from[i].
-template <std::size_t vectors>
-HOLDFAST_INLINE void sum_rows(const PriorGroup& group, const std::uint32_t* numbers,
-                              std::size_t members, const std::size_t* from, Lanes* sums) {
-    Lanes totals[vectors] = {};
-    const std::size_t columns = group.vectors * lane_count;
-    for (std::size_t i = 0; i < members; ++i) {
-        const double* row = group.weights + numbers[i] * columns;
-        for (std::size_t v = 0; v < vectors; ++v) totals[v] += load(row + from[v]);
+/// Points whose sums are made beside each other, so that no addition waits for the one before.
+inline constexpr std::size_t sums_together = registers == 1 ? 4 : 2;
+
+/// sums[i] = the sum over the i-th point's numbers, in their order, of eight posteriors' rows.
+template <std::size_t points>
+HOLDFAST_INLINE void sum_rows(const double* rows, const std::uint32_t* const* numbers,
+                              const std::size_t* members, Lanes* sums) {
+    std::size_t shortest = members[0];
+    for (std::size_t p = 1; p < points; ++p) {
+        if (members[p] < shortest) shortest = members[p];
     }
-    for (std::size_t v = 0; v < vectors; ++v) sums[v] = totals[v];
+    Lanes totals[points] = {};
+    for (std::size_t i = 0; i < shortest; ++i) {
+        for (std::size_t p = 0; p < points; ++p) {
+            totals[p] += load(rows + numbers[p][i] * lane_count);
+        }
+    }
+    for (std::size_t p = 0; p < points; ++p) {
+        for (std::size_t i = shortest; i < members[p]; ++i) {
+            totals[p] += load(rows + numbers[p][i] * lane_count);
+        }
+        sums[p] = totals[p];
+    }
+}
+
+/// The sums of equal points, which have one ball: sums[i] lacks the own[i]-th of its numbers. Own
+/// places ascend. Up to the first of them all sums are `before`, which has come to `begun`.
+static void sum_ball(const double* rows, const std::uint32_t* numbers, std::size_t members,
+                     const std::size_t* own, std::size_t& begun, Lanes& before, Lanes* sums) {
+    Lanes common = before;
+    for (; begun < own[0]; ++begun) common += load(rows + numbers[begun] * lane_count);
+    before = common;
+    Lanes totals[sums_together];
+    for (Lanes& each : totals) each = common;
+    std::size_t i = begun;
+    for (; i <= own[sums_together - 1]; ++i) {
+        const Lanes row = load(rows + numbers[i] * lane_count);
+        for (std::size_t p = 0; p < sums_together; ++p) {
+            if (own[p] != i) totals[p] += row;
+        }
+    }
+    for (; i < members; ++i) {
+        const Lanes row = load(rows + numbers[i] * lane_count);
+        for (Lanes& each : totals) each += row;
+    }
+    for (std::size_t p = 0; p < sums_together; ++p) sums[p] = totals[p];
 }
 
 /// The terms of eight points or fewer of the prior's entropy.
-static void prior_terms(const PriorGroup& group, const Lanes& prior, const Lanes& mass,
-                        const Neighborhood* around, std::size_t used, double* terms) {
+static Lanes prior_terms(const PriorGroup& group, const Lanes& prior, const Lanes& mass,
+                         const Neighborhood* around, std::size_t used) {
     const NearestNeighborConstants& constants = group.constants;
     Lanes radius_squared = splat(1.0), correction{};
     for (std::size_t i = 0; i < used; ++i) {
@@ -212,76 +251,171 @@ static void prior_terms(const PriorGroup& group, const Lanes& prior, const Lanes
     const Lanes rest = 1.0 - prior;
     const Lanes share = select(mass < rest, mass / rest, splat(1.0));
     const double half = 0.5 * static_cast<double>(group.dimension);
-    store_partial(terms,
-                  prior * (-log_of(share) + constants.log_ball_volume +
-                           half * log_of(radius_squared) + correction),
-                  used);
+    return prior * (-log_of(share) + constants.log_ball_volume + half * log_of(radius_squared) +
+                    correction);
 }
 
-/// For the points [begin, end): terms[n] of the prior's entropy, gains[n][vectors * 8] of the
-/// posteriors' information. `doubles` has 10 stride + 9 k places, `numbers` 8 (stride + 16).
-static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t end,
-                        double* doubles, std::uint32_t* all_numbers, double* terms, double* gains) {
-    const NearestNeighborConstants& constants = group.constants;
-    const std::size_t columns = group.vectors * lane_count;
-    const std::size_t stride = group.stride, k = group.neighbors;
+/// What is known of the points of a block, place by place.
+struct PriorPlaces {
+    const std::uint32_t* points;
+    Neighborhood around[prior_block_size];
+    const std::uint32_t* numbers[prior_block_size];  // of its neighbours; of equal points the ball
+    std::size_t own[prior_block_size];               // of equal points, the place in the ball
+    std::size_t end_of_equals[prior_block_size];     // where the points end that are equal to it
+    Lanes priors[prior_block_size / lane_count] = {}, masses[prior_block_size / lane_count] = {};
+    double inverse_masses[prior_block_size];
+};
+
+static bool equal_points(const PriorGroup& group, std::size_t a, std::size_t b) {
+    for (std::size_t c = 0; c < group.varying; ++c) {
+        const double* const column = group.coordinates + c * group.stride;
+        if (column[a] != column[b]) return false;
+    }
+    return true;
+}
+
+/// Finds the neighbours of the points at [0, count), once for equal ones.
+static void find_neighborhoods(const PriorGroup& group, std::size_t count, double* doubles,
+                               std::uint32_t* all_numbers, PriorPlaces& places) {
+    const std::size_t stride = group.stride, numbers_each = stride + 2 * lane_count;
     double* const rows = doubles + 2 * stride;
     double* const kept = rows + lane_count * stride;
-    const PriorScratch scratch{doubles, doubles + stride, kept + lane_count * k,  rows,
-                               kept,    all_numbers,      stride + 2 * lane_count};
     for (std::size_t j = 0; j < stride; j += lane_count) {
-        store(scratch.first + j, load(group.coordinates + j));
+        store(doubles + j, load(group.coordinates + j));
     }
-    Neighborhood found[lane_count];
-    Lanes priors{}, masses{};
-    for (std::size_t n = begin; n < end; ++n) {
-        const std::size_t place = (n - begin) % lane_count;
-        if (place == 0) {
-            for (Neighborhood& each : found) {
-                each = {0, 0, constants.resolution * constants.resolution};
-            }
-            const std::size_t used = end - n < lane_count ? end - n : lane_count;
-            if (k > 0) neighborhoods_of(group, n, used, scratch, found);
+    for (std::size_t first = 0; first < count;) {
+        std::size_t begins[lane_count + 1], used = 0;
+        std::uint32_t firsts[lane_count];
+        std::uint32_t* const numbers = all_numbers + first * numbers_each;
+        while (first < count && used < lane_count) {
+            begins[used] = first;
+            firsts[used++] = places.points[first];
+            do {
+                ++first;
+            } while (first < count && equal_points(group, firsts[used - 1], places.points[first]));
         }
-        const Neighborhood& around = found[place];
-        const std::uint32_t* const numbers = all_numbers + place * scratch.numbers_each;
-        const double* own_row = group.weights + n * columns;
-        double inverse_mass = 1.0;
-        for (std::size_t v = 0; v < group.vectors;) {
-            constexpr std::size_t most = 4;
-            std::size_t from[most], chosen = 0;
-            Lanes sums[most];
-            for (; v < group.vectors && chosen < most; ++v) {
-                if (bits_of(load(own_row + v * lane_count) > 0.0) != 0) {
-                    from[chosen++] = v * lane_count;
-                } else {
-                    store(gains + n * columns + v * lane_count, Lanes{});
+        begins[used] = first;
+        Neighborhood found[lane_count];
+        neighborhoods_of(group, firsts, used,
+                         {doubles, doubles + stride, kept + lane_count * group.neighbors, rows,
+                          kept, numbers, numbers_each},
+                         found);
+        for (std::size_t i = 0; i < used; ++i) {
+            std::uint32_t* const own = numbers + i * numbers_each;
+            const std::size_t begin = begins[i], end = begins[i + 1];
+            for (std::size_t place = begin; place < end; ++place) {
+                places.around[place] = found[i];
+                places.numbers[place] = own;
+                places.end_of_equals[place] = end;
+            }
+            if (end - begin == 1) continue;
+            std::size_t at = found[i].members;
+            for (; at > 0 && own[at - 1] > firsts[i]; --at) own[at] = own[at - 1];
+            own[at] = firsts[i];
+            for (std::size_t place = begin; place < end; ++place) {
+                while (own[at] != places.points[place]) ++at;
+                places.own[place] = at;
+            }
+        }
+    }
+}
+
+/// The gain of a point under eight posteriors.
+HOLDFAST_INLINE void put_gain(const PriorGroup& group, PriorPlaces& places, std::size_t place,
+                              std::size_t vector, const double* rows, const Lanes& sum,
+                              double* gains) {
+    const std::size_t n = places.points[place];
+    const Lanes own = load(rows + n * lane_count);
+    if (vector == 0 && group.neighbors > 0) {  // its first column is the prior
+        places.priors[place / lane_count][place % lane_count] = own[0];
+        places.masses[place / lane_count][place % lane_count] = sum[0];
+        places.inverse_masses[place] = 1.0 / mass_around(sum[0], own[0]);
+    }
+    const Lanes ratio =
+        select(own > 0.0, mass_around(sum, own) * places.inverse_masses[place], splat(1.0));
+    store(gains + (n * group.vectors + vector) * lane_count, own * log_of(ratio));
+}
+
+/// For the points at [begin, end) of the group's order, `prior_block_size` or fewer: terms[n] of
+/// the prior's entropy, gains[n][vectors * 8] of the posteriors' information. `doubles` has
+/// 10 stride + 9 k places, `all_numbers` prior_block_size (stride + 16).
+static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t end,
+                        double* doubles, std::uint32_t* all_numbers, double* terms, double* gains) {
+    const std::size_t count = end - begin;
+    PriorPlaces places;
+    places.points = group.order + begin;
+    if (group.neighbors > 0) {
+        find_neighborhoods(group, count, doubles, all_numbers, places);
+    } else {
+        places.around[0] = {0, 0, 1.0};
+        places.numbers[0] = all_numbers;
+        places.end_of_equals[0] = 1;
+        places.inverse_masses[0] = 1.0;
+    }
+    for (std::size_t v = 0; v < group.vectors; ++v) {
+        // One vector of posteriors after the other: its rows stay in the first cache.
+        const double* const rows = group.weights + v * group.count * lane_count;
+        const auto has_weight = [&](std::size_t place) HOLDFAST_LAMBDA {
+            const std::size_t n = places.points[place];
+            if (bits_of(load(rows + n * lane_count) > 0.0) != 0) return true;
+            store(gains + (n * group.vectors + v) * lane_count, Lanes{});
+            return false;
+        };
+        std::size_t chosen[prior_block_size], single = 0;
+        Lanes sums[sums_together];
+        for (std::size_t place = 0; place < count;) {
+            const std::size_t end_of_equals = places.end_of_equals[place];
+            if (end_of_equals - place == 1) {
+                if (has_weight(place)) chosen[single++] = place;
+                ++place;
+                continue;
+            }
+            const std::uint32_t* const numbers = places.numbers[place];
+            const std::size_t members = places.around[place].members + 1;
+            std::size_t begun = 0;
+            Lanes before{};
+            while (place < end_of_equals) {
+                std::size_t here[sums_together], own[sums_together], found = 0;
+                for (; place < end_of_equals && found < sums_together; ++place) {
+                    if (has_weight(place)) here[found++] = place;
+                }
+                if (found == 0) break;
+                for (std::size_t i = 0; i < sums_together; ++i) {
+                    own[i] = places.own[here[i < found ? i : found - 1]];
+                }
+                sum_ball(rows, numbers, members, own, begun, before, sums);
+                for (std::size_t i = 0; i < found; ++i) {
+                    put_gain(group, places, here[i], v, rows, sums[i], gains);
                 }
             }
-            if (chosen == 4) {
-                sum_rows<4>(group, numbers, around.members, from, sums);
-            } else if (chosen == 3) {
-                sum_rows<3>(group, numbers, around.members, from, sums);
-            } else if (chosen == 2) {
-                sum_rows<2>(group, numbers, around.members, from, sums);
-            } else if (chosen == 1) {
-                sum_rows<1>(group, numbers, around.members, from, sums);
+        }
+        for (std::size_t first = 0; first < single; first += sums_together) {
+            const std::size_t here =
+                single - first < sums_together ? single - first : sums_together;
+            const std::uint32_t* numbers[sums_together];
+            std::size_t members[sums_together];
+            for (std::size_t i = 0; i < here; ++i) {
+                numbers[i] = places.numbers[chosen[first + i]];
+                members[i] = places.around[chosen[first + i]].members;
             }
-            for (std::size_t i = 0; i < chosen; ++i) {
-                if (from[i] == 0 && k > 0) {  // column 0 is the prior
-                    priors[place] = own_row[0];
-                    masses[place] = sums[i][0];
-                    inverse_mass = 1.0 / mass_around(masses[place], priors[place]);
+            if (here == sums_together) {
+                sum_rows<sums_together>(rows, numbers, members, sums);
+            } else {
+                for (std::size_t i = 0; i < here; ++i) {
+                    sum_rows<1>(rows, numbers + i, members + i, sums + i);
                 }
-                const Lanes own = load(own_row + from[i]);
-                const Lanes ratio =
-                    select(own > 0.0, mass_around(sums[i], own) * inverse_mass, splat(1.0));
-                store(gains + n * columns + from[i], own * log_of(ratio));
+            }
+            for (std::size_t i = 0; i < here; ++i) {
+                put_gain(group, places, chosen[first + i], v, rows, sums[i], gains);
             }
         }
-        if (k > 0 && (place + 1 == lane_count || n + 1 == end)) {
-            prior_terms(group, priors, masses, found, place + 1, terms + n - place);
-        }
+    }
+    for (std::size_t first = 0; group.neighbors > 0 && first < count; first += lane_count) {
+        const std::size_t used = count - first < lane_count ? count - first : lane_count;
+        const std::size_t part = first / lane_count;
+        const Lanes own = prior_terms(group, places.priors[part], places.masses[part],
+                                      places.around + first, used);
+        for (std::size_t i = 0; i < used; ++i) terms[places.points[first + i]] = own[i];
     }
 }
 
