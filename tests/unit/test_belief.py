@@ -73,6 +73,7 @@ class TestMaking:
         assert belief.states.flags.c_contiguous
         assert belief.weights.tolist() == [0.5, 0.5]
         assert uniform_weights(3).tolist() == [1.0 / 3.0] * 3
+        assert not belief.weights.flags.writeable
 
     def test_weights_are_normalised(self) -> None:
         belief = Belief.weighted([[1.0], [2.0], [3.0]], [2.0, 0.0, 6.0])
@@ -248,7 +249,9 @@ class TestResample:
         draws = fresh().substream(substream)
         teeth = (np.arange(40) + draws.uniform()) / 40
         found = np.searchsorted(np.cumsum(belief.weights), teeth, side="right")
-        np.testing.assert_array_equal(resample(belief, draws).states, belief.states[found])
+        states = resample(belief, draws).states
+        np.testing.assert_array_equal(states, belief.states[found])
+        assert not states.flags.writeable
 
 
 class TestRegularised:
@@ -292,3 +295,6 @@ class TestRegularised:
         moved = regularised(belief, belief, (0, 1), (), fresh()).states
         np.testing.assert_allclose(moved[:, 1], 2.0 * moved[:, 0], atol=1e-5)
         assert np.abs(moved - belief.states).max() > 0.01
+        # Noise with the other sign would be as good for a filter, but decide otherwise.
+        noise = fresh().substream(0).normal((200, 2))[:, 0]
+        assert np.corrcoef((moved - belief.states)[:, 0], noise)[0, 1] > 0.9

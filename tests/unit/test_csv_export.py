@@ -5,14 +5,25 @@ from __future__ import annotations
 import csv
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from tests.recordings import a_sensing_step, a_task_step, configuration_of, result_of
 
 from holdfast.planning.belief import Belief
+from holdfast.planning.inputs import Late, encode_floats
 from holdfast.protocol.robot_events import Timing
 from holdfast.reports.csv_export import TABLES, CsvSink, state_labels
-from holdfast.reports.facts import EventFact, SensingFact, TaskFact, TrialBeginFact, TrialEndFact
+from holdfast.reports.facts import (
+    EventFact,
+    LateFact,
+    SensingFact,
+    TaskFact,
+    TrialBeginFact,
+    TrialEndFact,
+)
+from holdfast.robot.trial import LateStep
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -34,7 +45,10 @@ def test_rows(tmp_path: Path) -> None:
         sink.acted(TaskFact(a_task_step(belief, action, estimate), 1_700_000_000, None))
         again = a_sensing_step(belief, 1, step=1)
         sink.sensed(SensingFact(again, 2_500_000_000, 2_600_000_000, None))
-        sink.happened(EventFact(2_700_000_000, "status", {"status": "keep_alive"}))
+        sink.happened(EventFact(2_700_000_000, "status", {"status": "für"}))
+        late = Late(1, 0, encode_floats([0.25]))
+        step = LateStep(late, again.after, again.observation_info)
+        sink.observed_late(LateFact(step, 2_800_000_000))
         sink.trial_ends(TrialEndFact(0, 3_000_000_000, 1, None))
         sink.trial_begins(TrialBeginFact(1, 3_500_000_000))
         sink.trial_ends(TrialEndFact(1, 4_000_000_000, 10, result_of(1)))
@@ -51,5 +65,13 @@ def test_rows(tmp_path: Path) -> None:
     particles = rows_of(tables / "beliefs.csv")
     assert [row["when"] for row in particles] == ["sensing", "acting", "sensing"]
     assert float(particles[0][state_labels(problem)[0]]) == 0.1 + 0.2
-    (event,) = rows_of(tables / "events.csv")
-    assert (event["event"], event["fields"]) == ("status", '{"status": "keep_alive"}')
+    status, came = rows_of(tables / "events.csv")
+    assert (status["event"], status["fields"]) == ("status", '{"status": "für"}')
+    assert (came["event"], came["trial"]) == ("late_observation", "0")
+    assert '"taken": 0, "observation": [0.25]' in came["fields"]
+
+
+def test_labels_are_those_of_the_problem_if_it_has_one_for_each(tmp_path: Path) -> None:
+    assert state_labels(configuration_of(tmp_path).problem) == ["x (m)", "y (m)", "θ (rad)"]
+    some: Any = SimpleNamespace(state_size=3, state_labels=("x", "x", "y"))
+    assert state_labels(some) == ["state_0", "state_1", "state_2"]

@@ -36,7 +36,7 @@ class TestJournal:
         with Journal.create(path, {"key": "value"}) as journal:
             for result in results:
                 journal.add(result)
-        with Journal.open(path) as journal:
+        with JournalReader.read_run(tmp_path, "see") as journal:
             assert journal.meta()["key"] == "value"
             assert journal.finished() == {0, 1, 2}
             expected = sorted(map(without_decisions, results), key=lambda result: result.trial)

@@ -71,16 +71,18 @@ class TestTables:
     def test_summary(self) -> None:
         builder = SummaryBuilder()
         builder.add(result_of(0, reward=-1.0, sensing_ms=(1.0, 2.0)))
-        builder.add(result_of(1, reward=-3.0, sensing_ms=(3.0,)))
+        builder.add(result_of(1, reward=-3.0, sensing_ms=(3.00006,)))
         builder.add(result_of(2, reward=-8.0, success=False))
-        summary = builder.build(problem="p", seed=5, version="1", trials=4, wall_time_s=2.0)
+        summary = builder.build(problem="p", seed=5, version="1", trials=4, wall_time_s=2.0004)
         assert (summary.trials, summary.finished, summary.successes) == (4, 3, 2)
         assert summary.success_rate == pytest.approx(2 / 3)
         assert summary.mean_reward == pytest.approx(-4.0)
         assert summary.mean_reward_of_successes == pytest.approx(-2.0)
         assert summary.mean_steps == pytest.approx(11.0)
         assert summary.sensing_ms_median == pytest.approx(2.0)
-        assert summary.sensing_ms_p99 == pytest.approx(2.98)
+        assert (summary.sensing_ms_p99, summary.wall_time_s) == (2.9801, 2.0)
+        assert summary.earlier_code is msgspec.UNSET
+        assert summary.to_json().startswith('{\n  "')
         assert summary.unexplained_observations == 3
         assert json.loads(summary.to_json())["digest"] == summary.digest
         assert summary.failures == 0

@@ -17,7 +17,7 @@ class TestRestartPolicy:
     def test_a_process_that_answers_is_not_replaced(self) -> None:
         launches = RestartPolicy(RecoverySettings(relaunch_delay_ms=100.0))
         launches.want(0.0)
-        launches.begin(0.0)
+        assert launches.begin(0.0) == 1
         launches.failed(1.0)
         assert launches.is_due(1.0)
         launches.succeeded()

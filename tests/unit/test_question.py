@@ -7,7 +7,7 @@ import inspect
 import numpy as np
 import pytest
 
-from holdfast.errors import MessageError
+from holdfast.errors import HoldfastError, MessageError
 from holdfast.planning.inputs import Moved, encode_floats
 from holdfast.planning.planner import Planner, decode_checkpoint
 from holdfast.planning.settings import PlanningSettings
@@ -15,6 +15,7 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.messages import MAX_TASK_ACTIONS, SensingAnswer, TaskAnswer
 from holdfast.protocol.question import DecisionSource, InProcessSource, Question, same_actions
+from holdfast.protocol.robot_events import Halt
 
 
 def question(step: int = 0, *, sensed: bool = False, interval: int = 2) -> Question:
@@ -91,6 +92,14 @@ METHODS = [
     for name, member in vars(DecisionSource).items()
     if inspect.isfunction(member) and not name.startswith("_")
 ]
+
+
+def test_a_source_stops_once() -> None:
+    source = InProcessSource()
+    for _ in range(2):
+        source.stop(HoldfastError("why"))
+    (halt,) = source.effects
+    assert isinstance(halt, Halt)
 
 
 @pytest.mark.parametrize("source", [Dispatcher, InProcessSource])

@@ -21,7 +21,14 @@ from scipy import stats
 from holdfast import _kernel
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.numerics.geometry import DiscWorld
-from holdfast.numerics.randomness import NOISE_FREE, NoiseFreeStream, Purpose, Stream, stream
+from holdfast.numerics.randomness import (
+    NOISE_FREE,
+    NoiseFreeStream,
+    Purpose,
+    Stream,
+    seed_and_trial,
+    stream,
+)
 
 MASKED = np.ma.array([1, 2], mask=[True, False])
 named = partial(stream, 12, 3, 4, Purpose.PREDICTION)  # anew at each call
@@ -91,6 +98,11 @@ class TestNames:
     def test_seed_out_of_range(self, seed: int) -> None:
         with pytest.raises(InvalidValueError, match=rf"seed {seed}: .* 0 to {2**63 - 1}"):
             stream(seed, 0, 0, Purpose.PREDICTION)
+        for given in ((seed, 0), (0, -1), (0, 2**32)):
+            with pytest.raises(InvalidValueError, match="allowed are whole numbers from 0 to"):
+                seed_and_trial(*given)
+        greatest = 2**63 - 1, 2**32 - 1
+        assert (seed_and_trial(0, 0), seed_and_trial(*greatest)) == ((0, 0), greatest)
 
     @pytest.mark.parametrize(("trial", "step"), [(-1, 0), (2**32, 0), (0, -1), (0, 2**32)])
     def test_trial_or_step_out_of_range(self, trial: int, step: int) -> None:
@@ -182,7 +194,10 @@ class TestGoingOn:
 
     def test_one_that_has_ended_gives_nothing(self) -> None:
         own = named()
+        own._draws = 2**32 - 1
         own.normal()
+        with pytest.raises(InvalidValueError, match="and all have been made"):
+            own.normal()
         own.end()
         for draw in (own.normal, own.random, own.for_motion, lambda: own.substream(0)):
             with pytest.raises(ProblemError, match=r"for the one call .* kept from an earlier"):
@@ -233,6 +248,8 @@ class TestParameters:
         found = named().uniform(-1.0, [1.0, 2.0, 3.0], (4, 3))
         assert found.tobytes() == (-1.0 + np.array([2.0, 3.0, 4.0]) * standard).tobytes()
         assert named().uniform(high=np.array([2.0, 4.0])).shape == (2,)
+        found = named().uniform(low=[-1.0, 0.0])
+        assert found.tobytes() == (np.array([-1.0, 0.0]) + [2.0, 1.0] * named().random(2)).tobytes()
 
     @pytest.mark.parametrize("kind", ["normal", "uniform"])
     @pytest.mark.parametrize(

@@ -253,8 +253,10 @@ def test_the_account_of_a_trial() -> None:
     note()
     come_late(trial, 1, far)
     note()
+    assert (trial.num_missing, trial.awaited) == (0, ())
     begin_anew(trial)
     note()
+    assert not trial.is_lost
     assert counts == [
         *((0, 0, 0), (1, 1, 1), (1, 1, 1), (2, 2, 1), (2, 3, 1), (2, 4, 1), (2, 5, 1)),
         *((2, 6, 2), (2, 7, 2)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import multiprocessing
 import os
 import signal
 import sys
@@ -15,6 +16,8 @@ from tests.unit.test_trial import configuration_of, failing_configuration, one
 from holdfast.errors import InvalidValueError, TrialError, WorkerDiedError
 from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.robot import trial_pool
+from holdfast.robot.trial import TrialObserver
 from holdfast.robot.trial_pool import Arm, TrialPool
 
 
@@ -39,6 +42,7 @@ def test_trials_of_several_arms(tmp_path: Path, jobs: int) -> None:
             if done.trial == 0:
                 pool.submit(done.arm, 2)
         assert pool.waiting == 0
+        assert len(pool._workers) == (0 if jobs == 1 else jobs)
         for trial in range(5):
             pool.submit(arms[0], trial)
         pool.drop(arms[0])
@@ -149,7 +153,7 @@ def test_a_dead_worker_is_named_and_costs_no_other_trial(tmp_path: Path) -> None
     more = ((arm, trial) for trial in range(60))
     with TrialPool(2) as pool:
         with pytest.raises(
-            WorkerDiedError, match=r"SIGKILL while it ran trial \d+ of as it"
+            WorkerDiedError, match=r"SIGKILL while it ran trial \d+ of as it is \(often the machine"
         ) as died:
             for done in pool.run(more):
                 finished.append(done.trial)
@@ -159,3 +163,40 @@ def test_a_dead_worker_is_named_and_costs_no_other_trial(tmp_path: Path) -> None
                     os.kill(pid, signal.SIGKILL)
         finished += [done.trial for done in pool.run(more)]
     assert sorted([*finished, died.value.trial]) == list(range(60))
+
+
+def test_an_overdue_trial_costs_its_worker_and_no_other_trial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arm, _ = arms_of(tmp_path)
+    asked: list[tuple[Arm, float]] = []
+
+    def is_overdue(arm: Arm, ran_s: float) -> bool:
+        asked.append((arm, ran_s))
+        return len(asked) == 1  # while the worker starts
+
+    monkeypatch.setattr(trial_pool, "_TICK_S", 0.0)
+    with TrialPool(1, overdue=is_overdue) as pool:
+        for trial in range(2):
+            pool.submit(arm, trial)
+        with pytest.raises(WorkerDiedError, match=r"was ended after 0\.0 s .* 0 of as") as ended:
+            list(pool.run())
+        assert (ended.value.overdue, ended.value.killed) == (True, False)
+        assert "memory" not in str(ended.value)
+        assert asked[0][0] is arm
+        assert asked[0][1] < 0.0
+        assert [done.trial for done in pool.run()] == [1]
+
+
+def test_a_daemonic_process_starts_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What fails there, and is nothing of its problem, has a note that names the trial."""
+    observer = TrialObserver()
+    vars(observer)["trial_began"] = float  # which takes no environment
+    arm, _ = arms_of(tmp_path)
+    daemon = vars(multiprocessing.current_process())["_config"]
+    monkeypatch.setitem(daemon, "daemon", True)
+    with TrialPool(2, observer=observer, overdue=lambda *_: True) as pool:
+        pool.submit(arm, 4)
+        with pytest.raises(TypeError) as failed:
+            list(pool.run())
+    assert failed.value.__notes__ == ["in trial 4 (seed 3) of as it is"]

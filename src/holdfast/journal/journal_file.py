@@ -211,7 +211,7 @@ class JournalFile:
         """Yield the payload and the end of each whole frame, up to the first that is not whole."""
         offset, before = position
         chunk, start, size = b"", 0, os.fstat(self.descriptor).st_size
-        while offset + _FRAME.size <= size:
+        while True:
             if len(chunk) - start < _FRAME.size:
                 chunk, start = os.pread(self.descriptor, chunk_bytes, offset), 0
                 if len(chunk) < _FRAME.size:

@@ -134,8 +134,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     return type(value)(map(plain, value)) if type(value) in (list, tuple) else value
-
-
-def floats_or_none(shown: npt.ArrayLike | None) -> FloatArray | None:
-    """Return a copy of what was shown, as float64; None for nothing."""
-    return None if shown is None else np.array(shown, dtype=np.float64)

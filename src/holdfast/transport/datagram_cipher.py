@@ -29,6 +29,7 @@ OVERHEAD = _HEADER.size + _TAG_BYTES
 """Bytes that a datagram is longer than its message."""
 
 WINDOW = 1024
+_ALL_SEEN = (1 << WINDOW) - 1
 """Counters below the newest that are still accepted."""
 
 LOSS_SAMPLE = 128
@@ -89,13 +90,10 @@ class ReplayWindow:
 
     def note(self, counter: int) -> None:
         """Record the counter of an authentic datagram."""
-        behind = self.newest - counter
-        if behind >= 0:
-            self._seen |= 1 << behind
-            return
-        self._seen = self._seen << -behind & (1 << WINDOW) - 1 if -behind < WINDOW else 0
-        self._seen |= 1
-        self.newest = counter
+        if counter > self.newest:
+            self._seen = self._seen << min(counter - self.newest, WINDOW) & _ALL_SEEN
+            self.newest = counter
+        self._seen |= 1 << self.newest - counter
 
     @property
     def num_lost(self) -> int:
