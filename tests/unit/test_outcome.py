@@ -38,8 +38,9 @@ def test_what_is_noted_is_read_back() -> None:
     assert list(decisions) == [
         Sensed(0, 1, b"", DIGEST),
         ActingRecord(0, encode_floats([0.5, -0.0])),
-        ActingRecord(1, encode_floats([1e-300, 2.0])),
+        (last := ActingRecord(1, encode_floats([1e-300, 2.0]))),
     ]
+    assert last.task_action.tolist() == [1e-300, 2.0]
     assert decisions.digest() == hashlib.blake2b(decisions.log, digest_size=32).hexdigest()
 
 

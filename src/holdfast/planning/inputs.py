@@ -48,6 +48,11 @@ class ActingRecord(msgspec.Struct, array_like=True, frozen=True, tag=2):
     step: int
     action: bytes
 
+    @property
+    def task_action(self) -> FloatArray:
+        """The numbers, shape (action_size,)."""
+        return decode_floats(self.action, None)
+
 
 class Moved(msgspec.Struct, array_like=True, frozen=True, tag=3):
     """The task action was performed. Written before anything else is ordered.
