@@ -15,6 +15,7 @@ from tests.unit.test_trial import configuration_of, failing_configuration, one
 from holdfast.errors import InvalidValueError, TrialError, WorkerDiedError
 from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.robot import trial_pool
 from holdfast.robot.trial_pool import Arm, TrialPool
 
 
@@ -159,3 +160,32 @@ def test_a_dead_worker_is_named_and_costs_no_other_trial(tmp_path: Path) -> None
                     os.kill(pid, signal.SIGKILL)
         finished += [done.trial for done in pool.run(more)]
     assert sorted([*finished, died.value.trial]) == list(range(60))
+
+
+class Large(PegInHole2D):
+    """More than a pipe holds; never returns while a file is there."""
+
+    def __init__(self, flag: Path) -> None:
+        super().__init__()
+        self.flag, self.more = flag, bytes(1 << 21)
+
+    def initial_states(self, stream: Any, count: int) -> Any:
+        while self.flag.exists():
+            pass
+        return super().initial_states(stream, count)
+
+
+def test_a_worker_that_hangs_does_not_hold_up_who_has_more_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial_pool, "_LOOKAHEAD_S", 1e9)  # all that one worker may be sent at once
+    flag = tmp_path / "flag"
+    arms = [dataclasses.replace(a, problem=Large(flag), plain=None) for a in arms_of(tmp_path)]
+    with TrialPool(1, overdue=lambda _, ran_s: flag.exists() and ran_s > 0.0) as pool:
+        assert len(list(pool.run((each, 0) for each in arms))) == 2
+        flag.touch()
+        for trial in (1, 2):  # the second time a new worker knows neither
+            with pytest.raises(WorkerDiedError, match="was ended after"):
+                list(pool.run((each, trial) for each in arms))
+        flag.unlink()
+        assert len(list(pool.run())) == 2
