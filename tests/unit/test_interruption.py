@@ -160,15 +160,12 @@ def test_few_particles_among_many_obstacles_leave_the_interpreter() -> None:
     ahead = {"end_0": [-1000.0, -9.0], "end_1": [-1000.0, 9.0]}
     elsewhere = {"end_0": [100.0, 100.0], "end_1": [100.0, 101.0]}
     problem = CapsuleRobot.from_settings({"walls": [elsewhere] * 9000 + [ahead]}, {})
+    states = np.tile([-1001.0, 0.0], (1000, 1))
     interruption = Interruption()
     other = threading.Timer(0.02, interruption.set)
     other.start()
     with pytest.raises(InterruptedComputationError), interruptible(interruption):
-        problem.move(
-            np.tile([-1001.0, 0.0], (1000, 1)),
-            np.array([1.0, 0.0]),
-            stream(0, 0, 0, Purpose.PREDICTION),
-        )
+        problem.move(states, np.array([1.0, 0.0]), stream(0, 0, 0, Purpose.PREDICTION))
     other.join()
 
 
@@ -178,11 +175,10 @@ def test_one_block_of_particles_in_an_obstacle_leaves_the_interpreter_and_ends()
     elsewhere = {"end_0": [100.0, 100.0], "end_1": [100.0, 101.0]}
     model = {"walls": [elsewhere] * 3000 + [around], "motion_cov": [1e-12, 1e-12]}
     problem = CapsuleRobot.from_settings(model, {})
+    states = np.tile([-1000.0, 1.0], (128, 1))
     interruption = Interruption()
     other = threading.Timer(0.02, interruption.set)
     other.start()
     with pytest.raises(InterruptedComputationError), interruptible(interruption):
-        problem.move(
-            np.tile([-1000.0, 1.0], (128, 1)), np.zeros(2), stream(0, 0, 0, Purpose.PREDICTION)
-        )
+        problem.move(states, np.zeros(2), stream(0, 0, 0, Purpose.PREDICTION))
     other.join()

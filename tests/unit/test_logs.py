@@ -120,8 +120,7 @@ class TestTargets:
         before = signal.signal(signal.SIGALRM, lambda *_: log.event("handler"))
         try:
             for number in range(3000):
-                # One in each event: by an interval, one would come in another's handler for ever
-                # where a line takes longer than that.
+                # One in each event: at an interval, they might never let a slow disk finish one.
                 signal.setitimer(signal.ITIMER_REAL, 1e-6 * (1 + number % 16))
                 log.event("main", number=number)
         finally:

@@ -200,3 +200,32 @@ def test_a_daemonic_process_starts_none(tmp_path: Path, monkeypatch: pytest.Monk
         with pytest.raises(TypeError) as failed:
             list(pool.run())
     assert failed.value.__notes__ == ["in trial 4 (seed 3) of as it is"]
+
+
+class Large(PegInHole2D):
+    """More than a pipe holds; never returns while a file is there."""
+
+    def __init__(self, flag: Path) -> None:
+        super().__init__()
+        self.flag, self.more = flag, bytes(1 << 21)
+
+    def initial_states(self, stream: Any, count: int) -> Any:
+        while self.flag.exists():
+            pass
+        return super().initial_states(stream, count)
+
+
+def test_a_worker_that_hangs_does_not_hold_up_who_has_more_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial_pool, "_LOOKAHEAD_S", 1e9)  # all that one worker may be sent at once
+    flag = tmp_path / "flag"
+    arms = [dataclasses.replace(a, problem=Large(flag), plain=None) for a in arms_of(tmp_path)]
+    with TrialPool(1, overdue=lambda _, ran_s: flag.exists() and ran_s > 0.0) as pool:
+        assert len(list(pool.run((each, 0) for each in arms))) == 2
+        flag.touch()
+        for trial in (1, 2):  # the second time a new worker knows neither
+            with pytest.raises(WorkerDiedError, match="was ended after"):
+                list(pool.run((each, trial) for each in arms))
+        flag.unlink()
+        assert len(list(pool.run())) == 2

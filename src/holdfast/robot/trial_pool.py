@@ -257,9 +257,12 @@ class TrialPool:
             times = self._times.get(arm)
             # One whose time nobody knows may be long.
             expected_s = _LOOKAHEAD_S if times is None else times.mean_s
+            # An arm may be larger than a pipe, so it waits for a worker that reads: one that runs a
+            # trial may never end, or wait until its answers are read.
             if worker.outstanding and (
                 len(worker.outstanding) == _MAX_LOOKAHEAD
                 or worker.expected_s + expected_s > _LOOKAHEAD_S
+                or not worker.has(arm)
             ):
                 return
             worker.send_trial(arm, trial, expected_s)
@@ -406,6 +409,10 @@ class _Worker(WorkerProcess):
         self.outstanding: deque[tuple[Arm, int, float]] = deque()
         self.expected_s = self.began_s = 0.0
         self._arms: dict[Arm, int] = {}
+
+    def has(self, arm: Arm) -> bool:
+        """Return whether it was sent the arm."""
+        return arm in self._arms
 
     def send_trial(self, arm: Arm, trial: int, expected_s: float) -> None:
         # If it is dead, its pipe tells when it is read, where we know which trial it had.
