@@ -195,7 +195,8 @@ class TestLoading:
         assert len(said) == 2
         assert "key.pem: others can read this key (mode 644)" in said[0]
         assert "certificate.pem: expires in 3.0 days, on 20" in said[1]
-        with pytest.warns(UserWarning, match="expires in"):
+        make_credentials(tmp_path, services=["service"], renew=True, days=1)
+        with pytest.warns(UserWarning, match=r"expires in 24\.0 hours"):
             load_credentials(tmp_path / "service", "service")
 
     def test_a_key_that_a_service_manager_or_a_cluster_hands_over_is_not_open(

@@ -59,7 +59,8 @@ def load_credentials(
     name, expires_s = _check_handshake(files, role)
     days_left = (expires_s - datetime.now(UTC).timestamp()) / 86_400.0
     if days_left < EXPIRES_SOON_DAYS:
-        warn(f"{files.certificate}: expires in {days_left:.1f} days, on {date_text(expires_s)}")
+        left = f"{days_left:.1f} days" if days_left >= 1.0 else f"{24 * days_left:.1f} hours"
+        warn(f"{files.certificate}: expires in {left}, on {date_text(expires_s)}")
     return LoadedCredentials(files, name, expires_s)
 
 
