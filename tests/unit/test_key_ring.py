@@ -13,6 +13,7 @@ import time
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography import x509
@@ -319,8 +320,9 @@ class TestArguments:
         self, tmp_path: Path, says: str, what: str, values: list[str]
     ) -> None:
         for value in values:
+            arguments: dict[str, Any] = {"services": ["service"], what: [value]}
             with pytest.raises(CredentialsError, match=says):
-                make_credentials(tmp_path, **{"services": ["service"], what: [value]})
+                make_credentials(tmp_path, **arguments)
         assert list(tmp_path.iterdir()) == []
 
     def test_a_host_without_a_service_is_refused(self, tmp_path: Path) -> None:
