@@ -309,11 +309,7 @@ class TestArguments:
     @pytest.mark.parametrize(
         ("says", "what", "values"),
         [
-            (
-                "at most 64",
-                "robots",
-                ["", ".", "a/b", "-x", ".b", "authority", "a" * 65, "é", "a\n"],
-            ),
+            ("at most 64", "robots", ["", "..", "a/b", "-x", ".b", "authority", "a" * 65, "é\n"]),
             ("'service': stands twice", "robots", ["service"]),
             ("is no host name and no IP", "hosts", ["", "tls/10.0.0.7:7447", "10.0.0.7:7447"]),
             ("is no host name and no IP", "hosts", ["[::1]", "a..b", "*.lan", "é.lan", "a b"]),
