@@ -309,8 +309,7 @@ class TestArguments:
     @pytest.mark.parametrize(
         ("says", "what", "values"),
         [
-            ("name ", "robots", ["", ".", "..", "a/b", "-x", ".hidden", "authority"]),
-            ("at most 64 letters", "robots", ["a" * 65, "a b", "é", "a\n"]),
+            ("at most 64", "robots", ["", "..", "a/b", "-x", ".b", "authority", "a" * 65, "é\n"]),
             ("'service': stands twice", "robots", ["service"]),
             ("is no host name and no IP", "hosts", ["", "tls/10.0.0.7:7447", "10.0.0.7:7447"]),
             ("is no host name and no IP", "hosts", ["[::1]", "a..b", "*.lan", "é.lan", "a b"]),
@@ -320,9 +319,9 @@ class TestArguments:
         self, tmp_path: Path, says: str, what: str, values: list[str]
     ) -> None:
         for value in values:
-            arguments: dict[str, Any] = {"services": ["service"], what: [value]}
+            named: dict[str, Any] = {"services": ["service"], what: [value]}
             with pytest.raises(CredentialsError, match=says):
-                make_credentials(tmp_path, **arguments)
+                make_credentials(tmp_path, **named)
         assert list(tmp_path.iterdir()) == []
 
     def test_a_host_without_a_service_is_refused(self, tmp_path: Path) -> None:
@@ -340,10 +339,9 @@ class TestArguments:
         assert made.made[0].expires - datetime.now(UTC) > (days - 1) * DAY
 
     def test_a_name_of_64_letters_and_an_empty_directory_of_it(self, tmp_path: Path) -> None:
-        name = "x" * 64
-        (tmp_path / name).mkdir()
-        make_credentials(tmp_path, robots=[name])
-        assert (tmp_path / name / "key.pem").exists()
+        (tmp_path / ("x" * 64)).mkdir()
+        make_credentials(tmp_path, robots=["x" * 64])
+        load_credentials(tmp_path / ("x" * 64), "robot")
 
     def test_as_many_names_as_one_call_may_have(
         self, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -455,10 +453,9 @@ class TestCommand:
             command = [sys.executable, "-m", "holdfast", "keys", str(tmp_path), "--rotate"]
             with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as second:
                 assert second.stderr is not None
-                said = second.stderr.readline()
-                first.stdin.write("go on\n")  # before anything fails: the second waits for it
+                assert "another 'holdfast keys' is at work" in second.stderr.readline()
+                first.stdin.write("go on\n")
                 first.stdin.flush()
-                assert "another 'holdfast keys' is at work" in said
                 _, errors = second.communicate(timeout=60)
             assert (first.wait(60), second.returncode, errors) == (0, 0, "")
         load_credentials(tmp_path / "anna", "robot")
