@@ -67,7 +67,7 @@ def _drawn(
         if configuration.environment.object is not None and path.exists():
             return None
         result = next(each for each in directory.journal.results() if each.trial == trial)
-        again_s = 1e-3 * result.mean_sensing_ms * result.sensing_decisions
+        again_s = 1e-3 * sum(result.sensing_ms)
         if again_s > _LONGEST_REPETITION_S:
             return Remark(
                 f"no figure, because trial {trial} would have to be run again for it, "

@@ -66,6 +66,10 @@ class Moved(msgspec.Struct, array_like=True, frozen=True, tag=3):
     motion: bytes = b""
     observation: bytes = b""
 
+    def numbers(self) -> tuple[FloatArray | None, FloatArray | None]:
+        """Return the motion and the observation."""
+        return numbers_of(self.motion), numbers_of(self.observation)
+
 
 class PausedRecord(msgspec.Struct, array_like=True, frozen=True, tag=4):
     """The robot's process ended in order: nothing happened after the records before."""
@@ -124,10 +128,9 @@ def fold(
         return planner.reinitialise(state), None
     assert isinstance(given, Moved)
     assert action is not None
-    after = planner.advance(state, action, numbers_of(given.motion))
-    if not given.observation:
-        return after, None
-    return planner.observe_move(after, action, decode_floats(given.observation, None))
+    motion, shown = given.numbers()
+    after = planner.advance(state, action, motion)
+    return (after, None) if shown is None else planner.observe_move(after, action, shown)
 
 
 def has_shown(record: Record) -> bool:

@@ -156,7 +156,7 @@ class CsvSink:
                 **_decider_cells("sensing", sensing.decider),
             }
         if fact is not None:
-            acted, (motion, observation) = fact.step, fact.shown
+            acted, (motion, observation) = fact.step, fact.step.moved.numbers()
             row |= {
                 "stage": acted.task_info.stage,
                 "reward": acted.reward,

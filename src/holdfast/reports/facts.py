@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, Protocol
 from holdfast.journal.run_clock import Stamp
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.belief import Belief
-from holdfast.planning.inputs import numbers_of
 from holdfast.planning.outcome import TrialResult
 from holdfast.protocol.robot_events import Timing
 from holdfast.robot.trial import LateStep, SensingStep, TaskStep
@@ -66,12 +65,6 @@ class TaskFact(NamedTuple):
     time_ns: int
     decider: Timing | None
     true_state: FloatArray | None = None  # before the action
-
-    @property
-    def shown(self) -> tuple[FloatArray | None, FloatArray | None]:
-        """What the move has shown: its motion, and its observation."""
-        moved = self.step.moved
-        return numbers_of(moved.motion), numbers_of(moved.observation)
 
 
 class LateFact(NamedTuple):

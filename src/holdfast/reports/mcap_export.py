@@ -176,7 +176,7 @@ class McapSink:
         self._state(now, state.belief, step.task_info.estimate, true_state)
         labels = self._labels if len(action) == len(self._labels) else ["action"]
         self._array(now, "/holdfast/task_action", action, "; ".join(labels))
-        for name, shown in zip(("motion", "move_observation"), fact.shown, strict=True):
+        for name, shown in zip(("motion", "move_observation"), step.moved.numbers(), strict=True):
             if shown is not None:
                 self._array(now, f"/holdfast/{name}", shown, name)
         if reward is not None:

@@ -230,8 +230,8 @@ class _Collector:
             stages=np.array([step.task_info.stage for step in acted], dtype=np.int64),
             rewards=np.array(rewards, dtype=np.float64),
             true_states=np.array(true_states) if true_states else None,
-            motions=tuple(_shown(task.shown[0]) for task in tasks),
-            move_observations=tuple(_shown(task.shown[1]) for task in tasks),
+            motions=tuple(_shown(step.moved.numbers()[0]) for step in acted),
+            move_observations=tuple(_shown(step.moved.numbers()[1]) for step in acted),
         )
 
 
