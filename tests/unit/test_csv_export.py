@@ -46,7 +46,9 @@ def test_rows(tmp_path: Path) -> None:
         sink.sensed(SensingFact(again, 2_500_000_000, 2_600_000_000, None))
         sink.happened(EventFact(2_700_000_000, "status", {"status": "für"}))
         late = Late(1, 0, encode_floats([0.25]))
-        sink.observed_late(LateFact(LateStep(late, again.after, again.observation_info), 2_800_000_000))
+        sink.observed_late(
+            LateFact(LateStep(late, again.after, again.observation_info), 2_800_000_000)
+        )
         sink.trial_ends(TrialEndFact(0, 3_000_000_000, 1, None))
         sink.trial_begins(TrialBeginFact(1, 3_500_000_000))
         sink.trial_ends(TrialEndFact(1, 4_000_000_000, 10, result_of(1)))
