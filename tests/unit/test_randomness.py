@@ -249,7 +249,8 @@ class TestParameters:
         assert found.tobytes() == (-1.0 + np.array([2.0, 3.0, 4.0]) * standard).tobytes()
         assert named().uniform(high=np.array([2.0, 4.0])).shape == (2,)
         found = named().uniform(low=[-1.0, 0.0])
-        assert found.tobytes() == (np.array([-1.0, 0.0]) + [2.0, 1.0] * named().random(2)).tobytes()
+        expected = np.array([-1.0, 0.0]) + np.array([2.0, 1.0]) * named().random(2)
+        assert found.tobytes() == expected.tobytes()
 
     @pytest.mark.parametrize("kind", ["normal", "uniform"])
     @pytest.mark.parametrize(

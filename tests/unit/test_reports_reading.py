@@ -23,6 +23,9 @@ particle_filter: {num_particles: 40}
 simulator: {num_trials: 3, max_steps: 20, seed: 5}
 """
 
+ENCODERS = "encoders:PegWithEncoders"
+"""Its moves have a measured motion, and show something."""
+
 OWN_ROBOT = """
 import numpy as np
 
@@ -56,14 +59,17 @@ class Seen(TrialObserver):
 def recorded(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Recorded:
     def run(text: str = CONFIGURATION) -> RunArrays:
         (tmp_path / "run.yaml").write_text(text)
+        module = "from holdfast_lab.simulation.peg_with_encoders import PegWithEncoders\n"
+        (tmp_path / "encoders.py").write_text(module)
         assert run_here(capsys, tmp_path, "run", "run.yaml", "--out", "run", "-q").code in (0, 1)
-        return hf.open_run(tmp_path / "run")
+        return hf.open_run(tmp_path / "run", problem_directory=tmp_path)
 
     return run
 
 
-def test_the_arrays_are_what_was_run(recorded: Recorded) -> None:
-    run = recorded()
+@pytest.mark.parametrize("problem", ["peg_in_hole_2d", ENCODERS])
+def test_the_arrays_are_what_was_run(recorded: Recorded, problem: str) -> None:
+    run = recorded(CONFIGURATION.replace("peg_in_hole_2d", problem))
     configuration = run.configuration
     assert run.trials == (0, 1, 2)
     planner = hf.Planner(configuration.problem, configuration.planning)
@@ -80,6 +86,11 @@ def test_the_arrays_are_what_was_run(recorded: Recorded) -> None:
         assert trial.result.digest == result.digest == run.results["digest"][number]
         assert run.results["steps"][number] == result.steps == len(trial.task_actions)
         np.testing.assert_array_equal(trial.task_actions, [step.executed for step in seen.tasks])
+        moved = [step.moved for step in seen.tasks]
+        assert [motion.tobytes() for motion in trial.motions] == [each.motion for each in moved]
+        shown = [observation.tobytes() for observation in trial.move_observations]
+        assert shown == [each.observation for each in moved]
+        assert all(map(bool, shown)) is (problem == ENCODERS)
         assert trial.sensing_steps.tolist() == [step.before.step for step in seen.sensing]
         assert trial.sensing_actions.tolist() == [step.sensing_action for step in seen.sensing]
         np.testing.assert_array_equal(
