@@ -14,18 +14,11 @@ import threading
 from pathlib import Path
 
 import pytest
+from tests.unit.test_log_lines import CHANGE
 
 from holdfast.errors import OutputError
 from holdfast.runtime.events import BoundedEventLog
 from holdfast.runtime.logs import EventLog
-
-CHANGE: dict[str, object] = {
-    "from": "standard",
-    "to": "local_recovery",
-    "reason": "cloud is gone: link broken",
-    "trial": 3,
-    "duration_ms": 12.345678,
-}
 
 
 class TestTargets:
@@ -135,6 +128,7 @@ class TestTargets:
         program = textwrap.dedent("""
             import sys
             from holdfast.runtime.logs import EventLog
+from tests.unit.test_log_lines import CHANGE
             log = EventLog(sys.stderr, component="robot")
             log.event("before")
             sys.stdin.readline()
