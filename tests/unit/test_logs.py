@@ -128,7 +128,6 @@ class TestTargets:
         program = textwrap.dedent("""
             import sys
             from holdfast.runtime.logs import EventLog
-from tests.unit.test_log_lines import CHANGE
             log = EventLog(sys.stderr, component="robot")
             log.event("before")
             sys.stdin.readline()
