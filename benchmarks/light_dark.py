@@ -212,7 +212,7 @@ def play_published(rule: str, seed: int, trial: int) -> World:
     world, known = World(seed, trial), Known()
     while not world.over:
         mean = known.shares @ PLACES
-        spread = math.sqrt(max(0.0, known.shares @ (PLACES - mean) ** 2))
+        spread = float(np.sqrt(known.shares @ (PLACES - mean) ** 2))
         if known.shares.max() > 0.9 if rule == "side" else spread <= float(rule):
             step = known.best_if_known()
         elif rule == "side":
@@ -397,5 +397,5 @@ def cells_of(seed: int) -> list[trial_table.Cell]:
 
 
 if __name__ == "__main__":
-    out = trial_table.main(__doc__, "runs/light_dark/trials.csv", 1000, cells_of, COLUMNS)
+    out = trial_table.main(__doc__, "runs/light_dark/trials.csv", 100, cells_of, COLUMNS)
     print(trial_table.ranked(out, COLUMNS[0], COLUMNS[1:]))
