@@ -258,7 +258,7 @@ PLANNERS: Mapping[str, dict[str, Any]] = {
         "depth": 20,
         "exploration_constant": 20.0,
         "n_simulations": 10_000,
-        "k_a": len(ROCKS) + 5.0,
+        "k_a": len(ROCKS) + 4.5,
         "alpha_a": 0.0,
         "k_o": 3.0,
         "alpha_o": 0.5,

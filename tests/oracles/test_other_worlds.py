@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from benchmarks import rock_sample, source_location
+from benchmarks import light_dark, rock_sample, source_location
 from benchmarks.sensor_management import BEARING, MISSED, RANGE, Beam
 
 from holdfast.numerics.randomness import Purpose, stream
@@ -30,6 +30,24 @@ class TestRockSample:
         world = rock_sample.World(0, 0)
         beside = np.flatnonzero((rock_sample.ROCKS == (0, 1)).all(axis=1))[0]
         assert world.accuracy(beside) == pytest.approx(0.5 + 0.5 * 2.0 ** (-2.0 / 20.0))
+
+
+class TestLightDark:
+    @pytest.mark.parametrize("place", [-30, -6, 0, 7, 30])
+    def test_a_known_place_earns_its_value(self, place: int) -> None:
+        problem, world = light_dark.LightDarkLine(), light_dark.World(0, 0)
+        world.place = place
+        value = problem.known_state_return(np.array([[float(place)]]), np.zeros(1, dtype=int))
+        while not world.over:
+            way = problem.policy(np.array([float(world.place)]), 0)
+            world.act(int(problem.limit_action(way)[0]))
+        assert world.reward == pytest.approx(value[0])
+
+    def test_a_published_policy_earns_nearly_what_was_published(self) -> None:
+        rule, mean, _ = light_dark.PUBLISHED["side"]
+        rewards = [light_dark.play_published(rule, 0, trial).reward for trial in range(400)]
+        # Its authors' filter, which draws some particles anew, is surer a little later.
+        assert 0.0 < np.mean(rewards) - mean < 4.0
 
 
 class TestSourceLocation:

@@ -14,18 +14,11 @@ import threading
 from pathlib import Path
 
 import pytest
+from tests.unit.test_log_lines import CHANGE
 
 from holdfast.errors import OutputError
 from holdfast.runtime.events import BoundedEventLog
 from holdfast.runtime.logs import EventLog
-
-CHANGE: dict[str, object] = {
-    "from": "standard",
-    "to": "local_recovery",
-    "reason": "cloud is gone: link broken",
-    "trial": 3,
-    "duration_ms": 12.345678,
-}
 
 
 class TestTargets:

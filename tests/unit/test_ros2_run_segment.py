@@ -9,13 +9,12 @@ from typing import Any
 
 import pytest
 from tests.recordings import robot_configuration
+from tests.unit.test_robot_process import plain_digests
 
 from holdfast.config.loader import Configuration
 from holdfast.journal import journal_file
-from holdfast.planning.planner import Planner
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
-from holdfast.robot.trial import run_trial
 from holdfast.runtime.events import BoundedEventLog
 from holdfast_ros.ros2.run_segment import Ending, RunSegment, SegmentResult, World
 
@@ -67,22 +66,10 @@ def segments(configuration: Configuration, tmp_path: Path) -> Segments:
     return Segments(configuration, tmp_path / "run")
 
 
-def digests(configuration: Configuration) -> list[str]:
-    return [
-        run_trial(
-            Planner(configuration.problem, configuration.planning),
-            configuration.simulator.seed,
-            trial,
-            max_steps=configuration.simulator.max_steps,
-        ).digest
-        for trial in range(configuration.simulator.num_trials)
-    ]
-
-
 def test_all_trials(segments: Segments) -> None:
     outcome = segments.run()
     assert (outcome.ending, outcome.message) == (Ending.FINISHED, "2 trials")
-    assert [trial.digest for trial in outcome.trials] == digests(segments.configuration)
+    assert [trial.digest for trial in outcome.trials] == plain_digests(segments.configuration)
     assert (segments.path / "summary.json").exists()
     orders = segments.orders
     assert (outcome.status, outcome.num_finished) == ("standard", 2)
@@ -101,7 +88,7 @@ def test_parts_that_are_paused(segments: Segments) -> None:
     assert reasons[0] == "order 1"
     assert len(reasons) > 5
     assert outcome.ending == Ending.FINISHED
-    assert [trial.digest for trial in outcome.trials] == digests(segments.configuration)
+    assert [trial.digest for trial in outcome.trials] == plain_digests(segments.configuration)
 
 
 def test_after_a_reboot_a_person_has_to_say_so(
@@ -119,7 +106,7 @@ def test_after_a_reboot_a_person_has_to_say_so(
     assert outcome.message.endswith("(after_reboot)")
     outcome = segments.run(after_reboot=True)
     assert outcome.ending == Ending.FINISHED
-    assert [trial.digest for trial in outcome.trials] == digests(segments.configuration)
+    assert [trial.digest for trial in outcome.trials] == plain_digests(segments.configuration)
 
 
 def test_paused_before_it_began(segments: Segments) -> None:
@@ -174,7 +161,7 @@ def test_an_error_whose_reason_can_go_away(segments: Segments) -> None:
     Failing.broken.clear()
     outcome = segments.run()
     assert outcome.ending == Ending.FINISHED
-    assert [trial.digest for trial in outcome.trials] == digests(configuration)
+    assert [trial.digest for trial in outcome.trials] == plain_digests(configuration)
 
 
 def test_an_error_that_ends_the_run_for_good(segments: Segments) -> None:
