@@ -5,14 +5,7 @@ from __future__ import annotations
 import threading
 
 import pytest
-from tests.processes.faults import (
-    PATIENCE_S,
-    PATIENT,
-    References,
-    Site,
-    assert_identical,
-    document_of,
-)
+from tests.processes import faults
 
 PEG = "peg_in_hole_2d"
 
@@ -20,21 +13,23 @@ PEG = "peg_in_hole_2d"
 @pytest.mark.slow
 class TestTooManyForOne:
     @pytest.mark.parametrize("recovery", ["never", "on_failure"])
-    def test_all_runs_stay_right(self, recovery: str, site: Site, references: References) -> None:
+    def test_all_runs_stay_right(
+        self, recovery: str, site: faults.Site, references: faults.References
+    ) -> None:
         documents = []
         for problem in (PEG, "capsule_robot"):
             # Tens of milliseconds a decision; eight robots that are quick ask for more than that.
-            document = document_of(problem, particles=2000, max_steps=40)
+            document = faults.document_of(problem, particles=2000, max_steps=40)
             document["active_sensing"]["num_observation_samples"] = 400
             documents += [document] * 4
         small = site.service("--workers", "1").start()
-        everybody = threading.Barrier(len(documents), timeout=PATIENCE_S)
+        everybody = threading.Barrier(len(documents), timeout=faults.PATIENCE_S)
         robots, worlds = [], []
         for number, document in enumerate(documents):
             world, file = site.world(
                 document,
                 f"robot-{number}",
-                offload=PATIENT,
+                offload=faults.PATIENT,
                 recovery={"launch": recovery},
             )
             world.on("begin", 0, everybody.wait)
@@ -42,7 +37,7 @@ class TestTooManyForOne:
             robots.append(site.run(file, services=[small], out=f"out-{number}"))
         for robot, world, document in zip(robots, worlds, documents, strict=True):
             robot.finish()
-            assert_identical(robot.out, references(document))
+            faults.assert_identical(robot.out, references(document))
             world.assert_each_once(references(document))
         turned_away = [event for robot in robots for event in robot.matching("busy")]
         assert turned_away

@@ -17,12 +17,7 @@ from holdfast.errors import HoldfastError, MessageError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.inputs import CatchUpInput, decode_floats
 from holdfast.planning.planner import Planner, PlanningState, encode_checkpoint
-from holdfast.protocol.messages import (
-    DIGEST_SIZE,
-    MAX_TASK_ACTIONS,
-    SensingAnswer,
-    TaskAnswer,
-)
+from holdfast.protocol.messages import DIGEST_SIZE, MAX_TASK_ACTIONS, SensingAnswer, TaskAnswer
 from holdfast.protocol.robot_events import (
     ComputeOwnAnswer,
     Effects,

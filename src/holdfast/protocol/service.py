@@ -34,12 +34,7 @@ from holdfast.planning.planner import needs_sensing
 from holdfast.problems.problem import Problem
 from holdfast.protocol.computing_time import ExpectedTime
 from holdfast.protocol.decision_cost import ANY_MACHINE, Cost, Pricing
-from holdfast.protocol.messages import (
-    MAX_WORD,
-    Request,
-    SessionConfiguration,
-    pack_configuration,
-)
+from holdfast.protocol.messages import MAX_WORD, Request, SessionConfiguration, pack_configuration
 from holdfast.protocol.robot_events import Effects
 from holdfast.protocol.service_jobs import (
     Computed,
@@ -497,10 +492,7 @@ class Service:
         for record in self._calls.detach(task):
             if outcome.failure is None:
                 self._calls.send_need_state(
-                    record.call,
-                    record.number,
-                    differs=outcome.differs,
-                    diverged=outcome.diverged,
+                    record.call, record.number, differs=outcome.differs, diverged=outcome.diverged
                 )
             else:
                 self._calls.send_refused(record.call, record.number, *outcome.failure)
@@ -558,13 +550,7 @@ class Service:
             self._calls.send_sensing(record.call, record.number, digest, answer)
 
     def _reject_busy(
-        self,
-        call: int,
-        number: int,
-        key: SessionKey,
-        lane: int,
-        now: float,
-        least_ms: float = 1.0,
+        self, call: int, number: int, key: SessionKey, lane: int, now: float, least_ms: float = 1.0
     ) -> None:
         owner, session = key
         wait_ms = max(least_ms, 1e3 * self._queue[lane].wait_s(now, owner))

@@ -20,10 +20,7 @@ from typing import Any, NamedTuple, TypeAlias
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import HoldfastError, InvalidValueError
 from holdfast.numerics.arrays import FloatArray
-from holdfast.protocol.robot_events import (
-    EnvironmentEvent,
-    EnvironmentFailed,
-)
+from holdfast.protocol.robot_events import EnvironmentEvent, EnvironmentFailed
 from holdfast.robot.environment import CheckedEnvironment
 from holdfast.robot.environment_maker import EnvironmentMaker
 from holdfast.runtime.pool import ThreadPool
