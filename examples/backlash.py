@@ -8,7 +8,7 @@ the measured motion, and ``move_by_measurement`` moves the belief by it. In ``st
 (``stage`` 1) have an ``action_0`` of -0.1 and a ``motion`` of about 0::
 
     holdfast run examples/backlash.yaml
-    holdfast run examples/backlash.yaml --set 'environment.arguments={encoder: false}'
+    holdfast run examples/backlash.yaml --set environment.arguments.encoder=false
 """
 
 import numpy as np

@@ -11,6 +11,7 @@ run a program. An apostrophe before it says that it is a text.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 
 
@@ -29,6 +30,26 @@ def printable(text: str, *, keep: str = "\n\t") -> str:
 def one_line(text: str) -> str:
     """Return the text on one line, with every other unprintable character escaped."""
     return printable(" ".join(text.split()), keep="")
+
+
+def brief(value: object, most: int = 80) -> str:
+    """Return a value as Python writes it, on one line; ``...`` stands where a long one is cut."""
+    return cut(one_line(repr(value)), most)
+
+
+def cut(text: str, most: int) -> str:
+    """Return a text of at most so many characters, cut between words, with ``...`` there.
+
+    Of a path the end says more than the beginning, so both are kept.
+    """
+    if len(text) <= most:
+        return text
+    if "/" in text and " " not in text:
+        begin, end = text[: most // 4], text[most // 4 + 3 - most :]
+        return f"{begin[: begin.rfind('/') + 1]}...{end[max(0, end.find('/')) :]}"
+    begin = text[: most - 3]
+    whole = re.match(r".*(?=[\s,])", begin)
+    return f"{whole[0] if whole and len(whole[0]) > most // 2 else begin}..."
 
 
 def did_you_mean(text: str, known: Iterable[str], most: int = 1, sure: Sequence[str] = ()) -> str:

@@ -19,7 +19,7 @@ import msgspec.inspect
 from msgspec.inspect import FloatType, IntType, ListType, StrType, VarTupleType
 
 from holdfast.errors import InvalidValueError
-from holdfast.printable import did_you_mean
+from holdfast.printable import brief, cut, did_you_mean
 
 KeyPath = tuple[str | int, ...]
 """Keys and list indices that lead from the top of a document to a value."""
@@ -214,18 +214,18 @@ def as_path(what: str, value: Any) -> Path:
     except TypeError:
         path = Path()
     if str(value) in ("", "\0") or not isinstance(value, str | Path) or "\0" in str(path):
-        raise InvalidValueError(f"{what} is {value!r:.80}; it must be a path")
+        raise InvalidValueError(f"{what} is {brief(value)}; it must be a path")
     return path
 
 
 def as_function(what: str, value: Any) -> Callable[..., Any]:
     """Return a function; otherwise InvalidValueError names ``what``."""
     if not callable(value):
-        raise InvalidValueError(f"{what} is {value!r:.80}; it must be a function")
+        raise InvalidValueError(f"{what} is {brief(value)}; it must be a function")
     return value  # type: ignore[no-any-return]
 
 
 def shown(value: Any) -> str:
     """Return a value as a file may have it, on one line and at most 60 characters."""
     text = json.dumps(value, ensure_ascii=False, default=str)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return cut(text, 60)

@@ -144,15 +144,7 @@ def made_up(task: Task) -> pd.DataFrame:
         rows.append((run, "kill", 1.05, None, None, None, None, *fault))
         if wanted.actions:
             rows += [
-                (
-                    run,
-                    "action",
-                    0.011 * number,
-                    0,
-                    number,
-                    *[None] * 10,
-                    *end[-5:],
-                )
+                (run, "action", 0.011 * number, 0, number, *[None] * 10, *end[-5:])
                 for number in range(360)
             ]
     return pd.DataFrame(rows, columns=list(COLUMNS))

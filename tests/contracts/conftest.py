@@ -8,29 +8,23 @@ from pathlib import Path
 
 import pytest
 from cryptography.x509 import oid
-from tests.contracts.wires import (
-    WIRES,
-    Authority,
-    InProcessWire,
-    StreamWire,
-    Wire,
-)
+from tests.contracts import wires
 
 from holdfast.transport.endpoints import TlsFiles
 
 
 @pytest.fixture(scope="session")
-def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
-    return Authority(tmp_path_factory.mktemp("tls") / "authority")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> wires.Authority:
+    return wires.Authority(tmp_path_factory.mktemp("tls") / "authority")
 
 
 @pytest.fixture(scope="session")
-def robot_tls(authority: Authority) -> TlsFiles:
+def robot_tls(authority: wires.Authority) -> TlsFiles:
     return authority.issue("robot", oid.ExtendedKeyUsageOID.CLIENT_AUTH)
 
 
 @pytest.fixture(scope="session")
-def service_tls(authority: Authority) -> TlsFiles:
+def service_tls(authority: wires.Authority) -> TlsFiles:
     return authority.issue("service", oid.ExtendedKeyUsageOID.SERVER_AUTH)
 
 
@@ -41,31 +35,31 @@ def socket_directory() -> Iterator[Path]:
         yield Path(directory)
 
 
-@pytest.fixture(params=WIRES)
+@pytest.fixture(params=wires.WIRES)
 def wire(
     request: pytest.FixtureRequest,
     socket_directory: Path,
     robot_tls: TlsFiles,
     service_tls: TlsFiles,
-) -> Wire:
+) -> wires.Wire:
     match request.param:
         case "in_process":
-            return InProcessWire()
+            return wires.InProcessWire()
         case "launched":
-            return StreamWire("unix", socket_directory, launched=True)
+            return wires.StreamWire("unix", socket_directory, launched=True)
         case "tls" | "udp":
-            return StreamWire(
+            return wires.StreamWire(
                 request.param, socket_directory, robot_tls=robot_tls, service_tls=service_tls
             )
         case protocol:
-            return StreamWire(protocol, socket_directory)
+            return wires.StreamWire(protocol, socket_directory)
 
 
 @pytest.fixture
-def tcp(socket_directory: Path) -> StreamWire:
-    return StreamWire("tcp", socket_directory)
+def tcp(socket_directory: Path) -> wires.StreamWire:
+    return wires.StreamWire("tcp", socket_directory)
 
 
 @pytest.fixture
-def tls(socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles) -> StreamWire:
-    return StreamWire("tls", socket_directory, robot_tls=robot_tls, service_tls=service_tls)
+def tls(socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles) -> wires.StreamWire:
+    return wires.StreamWire("tls", socket_directory, robot_tls=robot_tls, service_tls=service_tls)

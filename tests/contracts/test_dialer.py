@@ -13,15 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.contracts.wires import (
-    PATIENCE_S,
-    Inbox,
-    Received,
-    Serve,
-    StreamWire,
-    echo,
-    until,
-)
+from tests.contracts.wires import PATIENCE_S, Inbox, Received, Serve, StreamWire, echo, until
 
 from holdfast.protocol.robot_events import (
     CallEnded,
@@ -389,8 +381,7 @@ class TestRedialling:
             tls=tls.service_tls if services == "tls" else None,
         )
         robot = StreamRobotTransport(
-            {"cloud": f"{robots}/{place}"},
-            tls=tls.robot_tls if robots == "tls" else None,
+            {"cloud": f"{robots}/{place}"}, tls=tls.robot_tls if robots == "tls" else None
         )
         inbox = Inbox()
         await service.start(echo)

@@ -9,18 +9,7 @@ from pathlib import Path
 
 import pytest
 from cryptography.x509 import oid
-from tests.contracts.wires import (
-    HELLO,
-    PATIENCE_S,
-    Authority,
-    Inbox,
-    Received,
-    StreamWire,
-    connected,
-    echo,
-    unreachable_into,
-    until,
-)
+from tests.contracts import wires
 
 from holdfast.protocol.robot_events import (
     CallEnded,
@@ -36,7 +25,7 @@ from holdfast.transport.tls import client_context
 
 
 class TestEndedLinks:
-    async def test_open_calls_are_told_and_others_are_not(self, tcp: StreamWire) -> None:
+    async def test_open_calls_are_told_and_others_are_not(self, tcp: wires.StreamWire) -> None:
         told: list[bytes] = []
 
         def serve(call: IncomingCall) -> None:
@@ -45,30 +34,30 @@ class TestEndedLinks:
                 call.end()
 
         await tcp.service("cloud", "b1").start(serve)
-        robot, inbox = tcp.robot("cloud"), Inbox()
+        robot, inbox = tcp.robot("cloud"), wires.Inbox()
         robot.start(inbox)
         await inbox.wait_for(ServiceAppeared("cloud", "b1"))
         robot.call("cloud", 1, b"answered")
         assert await inbox.of_call(1) == [CallEnded(1)]
         robot.call("cloud", 2, b"open")
         await robot.close()
-        await until(lambda: bool(told))
+        await wires.until(lambda: bool(told))
         assert told == [b"open"]
 
 
 class TestCertificates:
     async def test_strangers_see_nothing(
-        self, tls: StreamWire, robot_tls: TlsFiles, tmp_path: Path
+        self, tls: wires.StreamWire, robot_tls: TlsFiles, tmp_path: Path
     ) -> None:
         usage = oid.ExtendedKeyUsageOID.CLIENT_AUTH
-        foreign = Authority(tmp_path / "foreign").issue("robot", usage)
+        foreign = wires.Authority(tmp_path / "foreign").issue("robot", usage)
         # A stranger's certificate, but the right authority: it believes the service.
         stranger = TlsFiles(robot_tls.authority, foreign.certificate, foreign.key)
         received: list[bytes] = []
 
         def serve(call: IncomingCall) -> None:
             received.append(call.payload)
-            echo(call)
+            wires.echo(call)
 
         await tls.service("cloud", "b1").start(serve)
         address = tls.endpoint("cloud")
@@ -77,13 +66,13 @@ class TestCertificates:
             outsider = StreamRobotTransport(
                 {"cloud": address},
                 tls=files,
-                on_event=unreachable_into(refusals),
+                on_event=wires.unreachable_into(refusals),
             )
             tls.ends.append(outsider)
-            inbox = Inbox()
+            inbox = wires.Inbox()
             refusals.clear()
             outsider.start(inbox)
-            await until(lambda: bool(refusals))
+            await wires.until(lambda: bool(refusals))
             outsider.call("cloud", 1, b"stranger")
             assert await inbox.of_call(1) == [CallEnded(1)]
             assert inbox.events == [CallEnded(1)]
@@ -96,12 +85,12 @@ class TestCertificates:
         host, _, port = address.removeprefix("tls/").rpartition(":")
         with pytest.raises(ssl.SSLError, match="CERTIFICATE_REQUIRED"):
             reader, writer = await asyncio.open_connection(host, int(port), ssl=bare)
-            writer.write(HELLO)
+            writer.write(wires.HELLO)
             await reader.read()
         writer.close()
         with contextlib.suppress(ssl.SSLError):
             await writer.wait_closed()
-        robot, inbox = tls.robot("cloud"), Inbox()
+        robot, inbox = tls.robot("cloud"), wires.Inbox()
         robot.start(inbox)
         await inbox.wait_for(ServiceAppeared("cloud", "b1"))
         robot.call("cloud", 1, b"friend")
@@ -110,22 +99,22 @@ class TestCertificates:
         assert {"shows no certificate"} < set(tls.reasons())
 
     async def test_a_robot_has_the_name_of_its_certificate_or_tells_none(
-        self, tls: StreamWire
+        self, tls: wires.StreamWire
     ) -> None:
-        await tls.service("cloud", "b1").start(echo)
+        await tls.service("cloud", "b1").start(wires.echo)
         for name in ("robot", ""):
-            robot, inbox = tls.robot("cloud", name=name), Inbox()
+            robot, inbox = tls.robot("cloud", name=name), wires.Inbox()
             robot.start(inbox)
             await inbox.appeared()
-        robot, inbox = tls.robot("cloud", name="another"), Inbox()
+        robot, inbox = tls.robot("cloud", name="another"), wires.Inbox()
         robot.start(inbox)
-        await until(lambda: bool(tls.refusals) and bool(tls.reasons()))
+        await wires.until(lambda: bool(tls.refusals) and bool(tls.reasons()))
         reason = "says that it is another, and shows the certificate of robot"
         assert tls.refusals[0] == ("cloud", f"refuses this end, which {reason}")
         assert tls.reasons()[0] == reason
 
-    async def test_an_old_version_of_tls_is_refused(self, tls: StreamWire) -> None:
-        await tls.service("cloud", "b1").start(echo)
+    async def test_an_old_version_of_tls_is_refused(self, tls: wires.StreamWire) -> None:
+        await tls.service("cloud", "b1").start(wires.echo)
         assert tls.robot_tls is not None
         context = client_context(tls.robot_tls)
         context.minimum_version = context.maximum_version = ssl.TLSVersion.TLSv1_2
@@ -135,9 +124,9 @@ class TestCertificates:
 
     @pytest.mark.parametrize("group", ["ffdhe8192", "secp521r1"])
     async def test_nobody_chooses_a_key_exchange_that_takes_long(
-        self, tls: StreamWire, group: str
+        self, tls: wires.StreamWire, group: str
     ) -> None:
-        await tls.service("cloud", "b1").start(echo)
+        await tls.service("cloud", "b1").start(wires.echo)
         assert tls.robot_tls is not None
         context = client_context(tls.robot_tls)
         context.set_ecdh_curve(group)
@@ -146,36 +135,38 @@ class TestCertificates:
             await asyncio.open_connection(host, int(port), ssl=context)
 
     async def test_a_call_names_the_robot_s_certificate(
-        self, tls: StreamWire, tcp: StreamWire
+        self, tls: wires.StreamWire, tcp: wires.StreamWire
     ) -> None:
         for wire, name in ((tls, "robot"), (tcp, None)):
-            calls = Received()
-            robot, _, _ = await connected(wire, calls)
+            calls = wires.Received()
+            robot, _, _ = await wires.connected(wire, calls)
             robot.call("cloud", 1, b"")
             assert (await calls.next()).robot == name
 
     async def test_links_of_one_certificate_keep_no_other_out(
-        self, tls: StreamWire, authority: Authority, monkeypatch: pytest.MonkeyPatch
+        self, tls: wires.StreamWire, authority: wires.Authority, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(service_end, "MAX_LINKS", 3)
-        await tls.service("cloud", "b1").start(echo)
-        greedy = [(tls.robot("cloud"), Inbox()) for _ in range(3)]
+        await tls.service("cloud", "b1").start(wires.echo)
+        greedy = [(tls.robot("cloud"), wires.Inbox()) for _ in range(3)]
         for robot, inbox in greedy:
             robot.start(inbox)
             await inbox.wait_for(ServiceAppeared("cloud", "b1"))
         tls.robot_tls = authority.issue("one of many", oid.ExtendedKeyUsageOID.CLIENT_AUTH)
-        other, other_inbox = tls.robot("cloud"), Inbox()
+        other, other_inbox = tls.robot("cloud"), wires.Inbox()
         other.start(other_inbox)
         await other_inbox.wait_for(ServiceAppeared("cloud", "b1"))
         reason = "has 3 links, and another robot needs one of 3"
-        await until(lambda: tls.refusals[:1] == [("cloud", f"refuses this end, which {reason}")])
+        await wires.until(
+            lambda: tls.refusals[:1] == [("cloud", f"refuses this end, which {reason}")]
+        )
         full = "refuses this end, which is one too many: 3 robots are connected"
-        await until(lambda: ("cloud", full) in tls.refusals)  # as it is back
+        await wires.until(lambda: ("cloud", full) in tls.refusals)  # as it is back
         other.call("cloud", 1, b"question")
         assert await other_inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
         assert ServiceVanished("cloud", "b1") not in other_inbox
 
-    async def test_a_robot_can_be_closed_amid_a_handshake(self, tls: StreamWire) -> None:
+    async def test_a_robot_can_be_closed_amid_a_handshake(self, tls: wires.StreamWire) -> None:
         host, _, port = tls.endpoint("cloud").removeprefix("tls/").rpartition(":")
         heard = asyncio.Event()
 
@@ -186,8 +177,8 @@ class TestCertificates:
             writer.close()
 
         async with await asyncio.start_server(serve, host, int(port)):
-            robot, inbox = tls.robot("cloud"), Inbox()
+            robot, inbox = tls.robot("cloud"), wires.Inbox()
             robot.start(inbox)
-            await asyncio.wait_for(heard.wait(), PATIENCE_S)
+            await asyncio.wait_for(heard.wait(), wires.PATIENCE_S)
             await robot.close()
         assert inbox.events == []

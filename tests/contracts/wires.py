@@ -29,12 +29,7 @@ from tests.ports import free_port
 from tests.processes.faults import PATIENT
 
 from holdfast.protocol.messages import Refused, decode_reply
-from holdfast.protocol.robot_events import (
-    CallEnded,
-    ReplyReceived,
-    ServiceAppeared,
-    TransportEvent,
-)
+from holdfast.protocol.robot_events import CallEnded, ReplyReceived, ServiceAppeared, TransportEvent
 from holdfast.transport import frames
 from holdfast.transport.contract import IncomingCall, RobotTransport, ServiceTransport
 from holdfast.transport.endpoints import TlsFiles
@@ -278,11 +273,7 @@ class Authority:
         certificate = self._certify(subject, key.public_key(), usages)
         place = self.directory / name
         place.mkdir()
-        files = TlsFiles(
-            place / "authority.pem",
-            place / "certificate.pem",
-            place / "key.pem",
-        )
+        files = TlsFiles(place / "authority.pem", place / "certificate.pem", place / "key.pem")
         pem = serialization.Encoding.PEM
         files.authority.write_bytes(self._certificate.public_bytes(pem))
         files.certificate.write_bytes(certificate.public_bytes(pem))

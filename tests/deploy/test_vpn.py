@@ -20,22 +20,7 @@ from pathlib import Path
 
 import pytest
 from tests.deploy.docker import missing
-from tests.processes.faults import (
-    KEEP_ALIVE,
-    LOCAL_RECOVERY,
-    LOST,
-    PATIENCE_S,
-    QUICK,
-    RESTORED,
-    References,
-    Robot,
-    Service,
-    Site,
-    Story,
-    document_of,
-    sensing_steps,
-    wait_until,
-)
+from tests.processes import faults
 from tests.programs import completed
 
 from holdfast_lab.testbed.namespace import NetworkNamespace
@@ -74,7 +59,7 @@ class Network:
     def call(self, *command: str, fails: bool = False) -> str:
         """Run a command in it; return what it says."""
         done = subprocess.run(
-            [*self.prefix, *command], capture_output=True, text=True, timeout=PATIENCE_S
+            [*self.prefix, *command], capture_output=True, text=True, timeout=faults.PATIENCE_S
         )
         assert fails == (done.returncode != 0), f"{command}: {done.stderr}"
         return done.stdout + done.stderr
@@ -165,7 +150,7 @@ class End:
 
     def wait_for(self, words: str, count: int = 1) -> None:
         """Wait until it has said something so many times."""
-        wait_until(
+        faults.wait_until(
             lambda: self._log.read_text().count(words) >= count or self._has_ended(),
             f"{words!r} from a tunnel's end",
         )
@@ -178,7 +163,10 @@ class End:
         spaces = ["--mount", "--net", f"--pid=/proc/{self._process.pid}/ns/pid_for_children"]
         target = ["nsenter", "--target", str(self._process.pid), *spaces]
         return subprocess.run(
-            [*target, "bash", "-c", script], capture_output=True, timeout=PATIENCE_S, check=True
+            [*target, "bash", "-c", script],
+            capture_output=True,
+            timeout=faults.PATIENCE_S,
+            check=True,
         ).stdout.decode()
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
@@ -191,7 +179,9 @@ class End:
             self._process = None
             devices = Path("/proc/thread-self/net/dev")
             with self._network.entered():
-                wait_until(lambda: "holdfast:" not in devices.read_text(), "the device's end")
+                faults.wait_until(
+                    lambda: "holdfast:" not in devices.read_text(), "the device's end"
+                )
 
     def _has_ended(self) -> bool:
         return self._process is None or self._process.poll() is not None
@@ -263,7 +253,9 @@ def make_profiles(*words: str | Path, **variables: str) -> str:
 
 
 def called(*words: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    return completed([MAKE_PROFILES, *words], timeout=PATIENCE_S, env={**os.environ, **variables})
+    return completed(
+        [MAKE_PROFILES, *words], timeout=faults.PATIENCE_S, env={**os.environ, **variables}
+    )
 
 
 # -- fixtures ------------------------------------------------------------------------------------
@@ -284,7 +276,7 @@ def _tools() -> None:
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("keys")
-    with Site(directory) as site:
+    with faults.Site(directory) as site:
         hosts = ("--host", INSIDE, "--host", CLOUD)
         made = site.holdfast("keys", directory / "keys", *hosts)
         assert made.process.returncode == 0, made.account()
@@ -316,29 +308,29 @@ class Run:
     def __init__(
         self,
         internet: Internet,
-        site: Site,
-        references: References,
+        site: faults.Site,
+        references: faults.References,
         keys: Path,
         wire: str,
         host: str = INSIDE,
     ) -> None:
         self._internet = internet
         self._keys = keys
-        self.document = document_of("peg_in_hole_2d", max_steps=180)
+        self.document = faults.document_of("peg_in_hole_2d", max_steps=180)
         # So long an answer takes nearly the largest datagram that there is.
         self.document["simulator"]["sensing_intervals"] = 44
-        self.steps = sensing_steps(self.document)
+        self.steps = faults.sensing_steps(self.document)
         with internet.cloud.entered():
-            self.cloud: Service = site.service(
+            self.cloud: faults.Service = site.service(
                 *("--tls", str(keys / "service")),
                 endpoint=f"{wire}/{host}:{PORT}",
-                lease_ms=QUICK["lease_ms"],
+                lease_ms=faults.QUICK["lease_ms"],
             ).start()
         # The world that the robot acts on is where the robot is.
         with internet.robot.entered():
-            self.story = Story(site, references, self.document, offload=QUICK)
+            self.story = faults.Story(site, references, self.document, offload=faults.QUICK)
 
-    def finish(self) -> Robot:
+    def finish(self) -> faults.Robot:
         with self._internet.robot.entered():
             return self.story.run(self.cloud, options=("--tls", str(self._keys / "robot")))
 
@@ -353,14 +345,14 @@ class Run:
     ],
 )
 def test_cut_and_restored(
-    tunnel: Tunnel, wire: str, site: Site, references: References, keys: Path
+    tunnel: Tunnel, wire: str, site: faults.Site, references: faults.References, keys: Path
 ) -> None:
     run = Run(tunnel.internet, site, references, keys, wire)
     story, steps = run.story, run.steps
     story.at("sense", steps[1], tunnel.internet.cut)
-    story.at("perform", steps[2], tunnel.internet.restore, story.status(KEEP_ALIVE))
+    story.at("perform", steps[2], tunnel.internet.restore, story.status(faults.KEEP_ALIVE))
     robot = run.finish()
-    assert robot.statuses() == [LOST, RESTORED]
+    assert robot.statuses() == [faults.LOST, faults.RESTORED]
     # No datagram is too large for the tunnel.
     assert robot.matching("no_datagrams") == []
 
@@ -370,27 +362,27 @@ def test_cut_and_restored(
     ["openvpn", pytest.param("wireguard", marks=pytest.mark.slow)],  # 15 seconds
 )
 def test_the_clouds_end_is_killed_and_started_again(
-    tunnel: Tunnel, site: Site, references: References, keys: Path
+    tunnel: Tunnel, site: faults.Site, references: faults.References, keys: Path
 ) -> None:
     """With its keys, so that the robot's end must find that out; holdfast notices sooner."""
     run = Run(tunnel.internet, site, references, keys, "tls")
     story, steps = run.story, run.steps
     story.at("sense", steps[1], tunnel.cloud.kill)
     again = (tunnel.cloud.start, tunnel.cloud.wait_until_up)
-    story.at("perform", steps[2], *again, story.status(KEEP_ALIVE))
+    story.at("perform", steps[2], *again, story.status(faults.KEEP_ALIVE))
     robot = run.finish()
-    assert robot.statuses() == [LOST, RESTORED]
+    assert robot.statuses() == [faults.LOST, faults.RESTORED]
 
 
 @BOTH
 def test_a_robot_that_is_removed_in_mid_run(
-    tunnel: Tunnel, site: Site, references: References, keys: Path
+    tunnel: Tunnel, site: faults.Site, references: faults.References, keys: Path
 ) -> None:
     run = Run(tunnel.internet, site, references, keys, "tls")
     story, steps = run.story, run.steps
-    story.at("sense", steps[1], lambda: tunnel.remove("anna"), story.status(LOCAL_RECOVERY))
+    story.at("sense", steps[1], lambda: tunnel.remove("anna"), story.status(faults.LOCAL_RECOVERY))
     robot = run.finish()
-    assert robot.statuses() == [LOST]
+    assert robot.statuses() == [faults.LOST]
     if tunnel.kind == "openvpn":
         tunnel.cloud.wait_for("is revoked")
     # The next one is let in, at the same end.
@@ -399,7 +391,7 @@ def test_a_robot_that_is_removed_in_mid_run(
     tunnel.robot.start()
     tunnel.robot.wait_until_up()
     with tunnel.internet.robot.entered():
-        socket.create_connection((INSIDE, PORT), PATIENCE_S).close()
+        socket.create_connection((INSIDE, PORT), faults.PATIENCE_S).close()
 
 
 def test_openvpn_lets_no_stranger_in(tmp_path: Path, stack: contextlib.ExitStack) -> None:
@@ -446,11 +438,11 @@ def test_wireguard_lets_no_stranger_in(tmp_path: Path, stack: contextlib.ExitSta
         _, received, sent = end.call("wg show holdfast transfer").split()
         return int(received), int(sent)
 
-    wait_until(lambda: received_and_sent(tunnel.stranger)[1] > 0, "a stranger's attempt")
+    faults.wait_until(lambda: received_and_sent(tunnel.stranger)[1] > 0, "a stranger's attempt")
     tunnel.robot.start()
     tunnel.robot.wait_until_up()
     # Who came later is answered.
-    wait_until(lambda: received_and_sent(tunnel.robot)[0] > 0, "the cloud's answer")
+    faults.wait_until(lambda: received_and_sent(tunnel.robot)[0] > 0, "the cloud's answer")
     assert received_and_sent(tunnel.stranger)[0] == 0
 
 
@@ -459,19 +451,19 @@ def _public_key(profile: str) -> str:
 
 
 @BOTH
-def test_nothing_is_reached_beside_the_tunnel(tunnel: Tunnel, site: Site) -> None:
+def test_nothing_is_reached_beside_the_tunnel(tunnel: Tunnel, site: faults.Site) -> None:
     internet = tunnel.internet
     with internet.cloud.entered():
         site.service("--insecure", endpoint=f"tcp/{INSIDE}:{PORT}").start()
     with internet.robot.entered():
-        socket.create_connection((INSIDE, PORT), PATIENCE_S).close()
+        socket.create_connection((INSIDE, PORT), faults.PATIENCE_S).close()
     with internet.entered():
         with pytest.raises(ConnectionRefusedError):
-            socket.create_connection((CLOUD, PORT), PATIENCE_S)
+            socket.create_connection((CLOUD, PORT), faults.PATIENCE_S)
         # A machine takes packets for each of its addresses at each of its devices, so a neighbour
         # who sends them there gets in. This rule keeps it out (docs/deploy.md).
         internet.call("ip", "route", "add", INSIDE, "via", CLOUD)
-        socket.create_connection((INSIDE, PORT), PATIENCE_S).close()
+        socket.create_connection((INSIDE, PORT), faults.PATIENCE_S).close()
         rules = """
             table inet holdfast {
                 chain input {
@@ -482,10 +474,10 @@ def test_nothing_is_reached_beside_the_tunnel(tunnel: Tunnel, site: Site) -> Non
         """
         internet.cloud.call("nft", rules)
         with pytest.raises(ConnectionRefusedError):
-            socket.create_connection((INSIDE, PORT), PATIENCE_S)
+            socket.create_connection((INSIDE, PORT), faults.PATIENCE_S)
     for network in (internet.robot, internet.cloud):
         with network.entered():
-            socket.create_connection((INSIDE, PORT), PATIENCE_S).close()
+            socket.create_connection((INSIDE, PORT), faults.PATIENCE_S).close()
 
 
 # -- the script ----------------------------------------------------------------------------------

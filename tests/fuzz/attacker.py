@@ -40,11 +40,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
 from tests.fuzz import corpus, neighbours
-from tests.fuzz.attack_messages import (
-    checkpoints_in_obstacles,
-    hostile_settings,
-    odd_requests,
-)
+from tests.fuzz.attack_messages import checkpoints_in_obstacles, hostile_settings, odd_requests
 from tests.fuzz.honest_robots import HonestRobots
 from tests.fuzz.hostile_client import HostileMessages
 from tests.fuzz.measuring import Watch, flatness
@@ -346,11 +342,7 @@ def _longest_wait_ms(robots: HonestRobots) -> tuple[float, float]:
 
 
 def attacked(
-    transport: str,
-    seconds: float,
-    seed: int,
-    directory: Path,
-    ways: list[str] | None = None,
+    transport: str, seconds: float, seed: int, directory: Path, ways: list[str] | None = None
 ) -> tuple[dict[str, Any], list[str]]:
     """Attack a service for so long; return the report, and what must not have happened."""
     findings: list[str] = []

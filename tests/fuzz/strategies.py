@@ -105,9 +105,7 @@ _asked = {
     "session_configuration": st.none() | session_configurations,
 }
 requests: st.SearchStrategy[Request] = st.builds(
-    Request,
-    **_asked,
-    inputs=st.lists(observed | moved, max_size=MAX_INPUTS).map(tuple),
+    Request, **_asked, inputs=st.lists(observed | moved, max_size=MAX_INPUTS).map(tuple)
 ) | st.builds(Request, **_asked, checkpoint=st.binary(max_size=500))
 """With and without an opening, inputs and a checkpoint."""
 
@@ -143,13 +141,7 @@ records: st.SearchStrategy[Record] = st.one_of(
         sensing_ms=finite,
     ),
     st.builds(ActingRecord, step=words, action=numbers),
-    st.builds(
-        Moved,
-        step=words,
-        reward=st.none() | finite,
-        motion=numbers,
-        observation=numbers,
-    ),
+    st.builds(Moved, step=words, reward=st.none() | finite, motion=numbers, observation=numbers),
     st.builds(
         Late,
         step=words,

@@ -35,15 +35,7 @@ from holdfast.protocol.messages import (
     with_checksum,
 )
 from holdfast.protocol.request_queue import RequestQueue
-from holdfast.protocol.service_sessions import (
-    BRIEF,
-    FIRST,
-    LONG,
-    MEDIUM,
-    NEW,
-    PendingTask,
-    Session,
-)
+from holdfast.protocol.service_sessions import BRIEF, FIRST, LONG, MEDIUM, NEW, PendingTask, Session
 
 HONEST = (1, 2)
 KEYS = st.integers(100, 115)
@@ -310,10 +302,7 @@ def check_lane(queue: RequestQueue, waiting: list[PendingTask]) -> None:
 
 @pytest.mark.parametrize(
     ("runs", "steps"),
-    [
-        pytest.param(6, 30, id="quick"),
-        pytest.param(250, 80, marks=pytest.mark.slow, id="slow"),
-    ],
+    [pytest.param(6, 30, id="quick"), pytest.param(250, 80, marks=pytest.mark.slow, id="slow")],
 )
 def test_hostile_robots_break_no_limit_and_disturb_nobody(runs: int, steps: int) -> None:
     run_state_machine_as_test(

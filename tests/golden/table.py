@@ -59,10 +59,7 @@ class Run(NamedTuple):
     def configuration(self) -> Configuration:
         """Return what the command would run."""
         return load(
-            ROOT / self.file,
-            problem=self.problem,
-            num_trials=self.trials,
-            overrides=self.changes,
+            ROOT / self.file, problem=self.problem, num_trials=self.trials, overrides=self.changes
         )
 
     def digest(self) -> str:
@@ -155,11 +152,7 @@ def _resolutions() -> Iterator[Run]:
     yield Run("mixture, resolutions", PLAIN, 4, mixture)
     states = {"selector.method": "state_entropy", **short}
     yield Run(
-        "state_entropy, resolutions of states",
-        PLAIN,
-        4,
-        states,
-        "studies.passer_by:PasserBy",
+        "state_entropy, resolutions of states", PLAIN, 4, states, "studies.passer_by:PasserBy"
     )
 
 

@@ -8,15 +8,7 @@ from pathlib import Path
 
 import pytest
 from tests.ports import free_port
-from tests.processes.faults import (
-    COMMAND,
-    LOCAL_RECOVERY,
-    LOST,
-    References,
-    Site,
-    Story,
-    document_of,
-)
+from tests.processes import faults
 from tests.processes.test_tls import secure
 from tests.wire import HELLO, RawLink, hello_of
 
@@ -40,13 +32,13 @@ def limited(limits: str, *command: str) -> tuple[str, ...]:
         pytest.param("serve", 9, marks=pytest.mark.slow),
     ],
 )
-def test_too_few_are_refused_in_one_line(site: Site, command: str, number: int) -> None:
+def test_too_few_are_refused_in_one_line(site: faults.Site, command: str, number: int) -> None:
     port = free_port()
     arguments = ["serve", "--listen", f"tcp/127.0.0.1:{port}"]
     if command == "run":
-        file = site.configure(document_of(PEG))
+        file = site.configure(faults.document_of(PEG))
         arguments = ["run", str(file), "--out", "out", "--service", f"tcp/127.0.0.1:{port}"]
-    ended = site.process(*limited(f"-n {number}", *COMMAND, *arguments))
+    ended = site.process(*limited(f"-n {number}", *faults.COMMAND, *arguments))
     assert ended.wait() == 2, ended.account()
     (line,) = ended.output.splitlines()
     assert line.startswith(f"holdfast: error: this process may have {number} files")
@@ -55,20 +47,22 @@ def test_too_few_are_refused_in_one_line(site: Site, command: str, number: int) 
     assert not (site.directory / "out").exists()
 
 
-def test_as_many_as_are_needed_are_enough(site: Site, references: References) -> None:
+def test_as_many_as_are_needed_are_enough(site: faults.Site, references: faults.References) -> None:
     """For a robot whose service dies and that launches its own, and for both services."""
     cloud = site.service()
     cloud.command = limited(f"-n {NEEDED}", *cloud.command)
     cloud.start()
-    story = Story(site, references, document_of(PEG))
-    story.at("perform", 30, cloud.kill, story.status(LOCAL_RECOVERY))
-    robot = site.run(story.file, services=[cloud], command=limited(f"-n {NEEDED}", *COMMAND))
+    story = faults.Story(site, references, faults.document_of(PEG))
+    story.at("perform", 30, cloud.kill, story.status(faults.LOCAL_RECOVERY))
+    robot = site.run(story.file, services=[cloud], command=limited(f"-n {NEEDED}", *faults.COMMAND))
     story.finish(robot)
-    assert robot.statuses() == [LOST]
+    assert robot.statuses() == [faults.LOST]
     assert cloud.process.matching("session_opened")
 
 
-def test_a_service_takes_what_it_is_allowed(site: Site, references: References) -> None:
+def test_a_service_takes_what_it_is_allowed(
+    site: faults.Site, references: faults.References
+) -> None:
     """Each robot is a socket: a soft limit is raised as far as the hard one allows."""
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     cloud = site.service()
@@ -77,11 +71,11 @@ def test_a_service_takes_what_it_is_allowed(site: Site, references: References) 
     wanted = NEEDED + MAX_UNKNOWN + MAX_LINKS
     soft = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
     assert resource.prlimit(cloud.process.pid, resource.RLIMIT_NOFILE) == (soft, hard)
-    robot = Story(site, references, document_of(PEG)).run(cloud)
+    robot = faults.Story(site, references, faults.document_of(PEG)).run(cloud)
     assert robot.statuses() == []
 
 
-def test_one_certificate_does_not_take_them_all(site: Site, keys: Path) -> None:
+def test_one_certificate_does_not_take_them_all(site: faults.Site, keys: Path) -> None:
     made = site.holdfast("keys", keys / "ours", "--robot", "greedy")
     assert made.process.returncode == 0, made.account()
     cloud = secure(site, keys, "tls")

@@ -10,149 +10,138 @@ import os
 import signal
 
 import pytest
-from tests.processes.faults import (
-    HERE,
-    KEEP_ALIVE,
-    LOST,
-    LOST_AGAIN,
-    PATIENT,
-    PROBLEMS,
-    QUICK,
-    RESTORED,
-    References,
-    Site,
-    Story,
-    document_of,
-    sensing_steps,
-    services_in_order,
-    wait_for_end,
-)
+from tests.processes import faults
 
 from holdfast.planning.settings import OffloadSettings
 
 PEG = "peg_in_hole_2d"
-OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in PROBLEMS if name != PEG]
+OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in faults.PROBLEMS if name != PEG]
 PEG_AND_SLOWLY_ALL = [PEG, *OTHERS]
 
 GATED = {
-    **document_of(PEG, max_steps=40),
+    **faults.document_of(PEG, max_steps=40),
     "problem": "gated_problem:GatedPeg",
-    "problem_directory": str(HERE),
+    "problem_directory": str(faults.HERE),
 }
 
 
-SERVES_GATED = ("--problem", "gated_problem:GatedPeg", "--problem-directory", str(HERE))
+SERVES_GATED = ("--problem", "gated_problem:GatedPeg", "--problem-directory", str(faults.HERE))
 
 
 class TestCloud:
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_killed_and_started_again(
-        self, problem: str, site: Site, references: References
+        self, problem: str, site: faults.Site, references: faults.References
     ) -> None:
-        document = document_of(problem)
-        struck, later = sensing_steps(document)[2:5:2]
+        document = faults.document_of(problem)
+        struck, later = faults.sensing_steps(document)[2:5:2]
         cloud = site.service().start()
-        story = Story(site, references, document)
+        story = faults.Story(site, references, document)
         # In mid-sensing: the robot needs the next decision as soon as it has sensed.
         story.at("sense", struck, cloud.kill)
-        story.at("perform", later, cloud.start, story.status(KEEP_ALIVE))
+        story.at("perform", later, cloud.start, story.status(faults.KEEP_ALIVE))
         robot = story.run(cloud)
-        assert robot.statuses() == [LOST, RESTORED]
+        assert robot.statuses() == [faults.LOST, faults.RESTORED]
         assert len(robot.matching("launch")) == 1
         assert robot.matching("launched")[0]["launch_ms"] > 0.0
         assert robot.matching("status")[1]["outage_ms"] > 0.0
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_stopped_for_longer_than_the_timeout(
-        self, problem: str, site: Site, references: References
+        self, problem: str, site: faults.Site, references: faults.References
     ) -> None:
-        document = document_of(problem)
-        struck, later = sensing_steps(document)[2:5:2]
-        cloud = site.service(lease_ms=QUICK["lease_ms"]).start()
-        story = Story(site, references, document, offload=QUICK)
+        document = faults.document_of(problem)
+        struck, later = faults.sensing_steps(document)[2:5:2]
+        cloud = site.service(lease_ms=faults.QUICK["lease_ms"]).start()
+        story = faults.Story(site, references, document, offload=faults.QUICK)
         story.at("sense", struck, cloud.stop)
-        story.at("perform", later, cloud.resume, story.status(KEEP_ALIVE))
+        story.at("perform", later, cloud.resume, story.status(faults.KEEP_ALIVE))
         robot = story.run(cloud)
-        assert robot.statuses() == [LOST, RESTORED]
+        assert robot.statuses() == [faults.LOST, faults.RESTORED]
         # It was its silence that gave it away, before its link was given up.
         assert "no sign of progress" in robot.matching("service_suspected")[0]["reason"]
 
     def test_with_the_settings_that_nobody_has_chosen(
-        self, site: Site, references: References
+        self, site: faults.Site, references: faults.References
     ) -> None:
-        document = document_of(PEG)
-        steps = sensing_steps(document)
+        document = faults.document_of(PEG)
+        steps = faults.sensing_steps(document)
         defaults = OffloadSettings()
         cloud = site.service(lease_ms=400.0).start()
-        offload = {key: getattr(defaults, key) for key in PATIENT}
-        story = Story(site, references, document, offload=offload)
+        offload = {key: getattr(defaults, key) for key in faults.PATIENT}
+        story = faults.Story(site, references, document, offload=offload)
         story.at("sense", steps[1], cloud.stop)
-        story.at("perform", steps[3], cloud.resume, story.status(KEEP_ALIVE))
+        story.at("perform", steps[3], cloud.resume, story.status(faults.KEEP_ALIVE))
         story.at("sense", steps[5], cloud.kill)
         robot = story.run(cloud)
         # On a busy machine a quarter of a second may also pass without a fault.
-        assert robot.statuses()[:2] == [LOST, RESTORED]
+        assert robot.statuses()[:2] == [faults.LOST, faults.RESTORED]
 
     @pytest.mark.parametrize(
         "holds_at", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 21))]
     )
     def test_killed_during_a_computation(
-        self, holds_at: int, site: Site, references: References
+        self, holds_at: int, site: faults.Site, references: faults.References
     ) -> None:
         gate = site.gate(holds_at)
         cloud = site.service(*SERVES_GATED)
         cloud.variables["HOLDFAST_TEST_GATE"] = str(gate.port)
         cloud.start()
-        story = Story(site, references, GATED)
+        story = faults.Story(site, references, GATED)
         robot = site.run(story.file, services=[cloud])
         gate.wait()
         cloud.kill()
         story.finish(robot)
-        assert robot.statuses() == [LOST]
+        assert robot.statuses() == [faults.LOST]
         assert not robot.matching("refused")
 
 
 class TestRecovery:
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_killed_together_with_the_cloud(
-        self, problem: str, site: Site, references: References
+        self, problem: str, site: faults.Site, references: faults.References
     ) -> None:
-        document = document_of(problem)
-        steps = sensing_steps(document)
+        document = faults.document_of(problem)
+        steps = faults.sensing_steps(document)
         cloud = site.service().start()
-        story = Story(site, references, document)
+        story = faults.Story(site, references, document)
 
         def kill_both() -> None:
             pid = story.running.recovery_pid()
             os.kill(pid, signal.SIGKILL)
             cloud.kill()
-            wait_for_end(pid)
+            faults.wait_for_end(pid)
 
         story.at("sense", steps[1], cloud.kill)
-        story.at("perform", steps[2], cloud.start, story.status(KEEP_ALIVE))
+        story.at("perform", steps[2], cloud.start, story.status(faults.KEEP_ALIVE))
         story.at("sense", steps[3], kill_both)
-        story.at("perform", steps[4], cloud.start, story.status(KEEP_ALIVE, 2))
+        story.at("perform", steps[4], cloud.start, story.status(faults.KEEP_ALIVE, 2))
         robot = story.run(cloud)
-        assert robot.statuses() == [LOST, RESTORED, LOST_AGAIN, RESTORED]
+        assert robot.statuses() == [
+            faults.LOST,
+            faults.RESTORED,
+            faults.LOST_AGAIN,
+            faults.RESTORED,
+        ]
         assert len(robot.matching("launched")) == 2
 
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
     def test_never_holds_until_the_cloud_is_back(
-        self, problem: str, site: Site, references: References
+        self, problem: str, site: faults.Site, references: faults.References
     ) -> None:
-        document = document_of(problem)
+        document = faults.document_of(problem)
         cloud = site.service().start()
-        story = Story(site, references, document, recovery={"launch": "never"})
+        story = faults.Story(site, references, document, recovery={"launch": "never"})
         story.at(
             "sense",
-            sensing_steps(document)[2],
+            faults.sensing_steps(document)[2],
             cloud.kill,
             lambda: story.running.wait_for("service_vanished"),
         )
         robot = site.run(story.file, services=[cloud])
         held = robot.wait_for("holding")
         assert held["reason"] == f"{cloud.endpoint}: is not there"
-        assert held["step"] == sensing_steps(document)[2]
+        assert held["step"] == faults.sensing_steps(document)[2]
         cloud.start()
         story.finish(robot)
         assert robot.matching("resumed")[0]["held_ms"] > 0.0
@@ -162,11 +151,13 @@ class TestRecovery:
 
 class TestReplicas:
     @pytest.mark.parametrize("problem", PEG_AND_SLOWLY_ALL)
-    def test_killed_in_turn(self, problem: str, site: Site, references: References) -> None:
-        document = document_of(problem)
-        steps = sensing_steps(document)
+    def test_killed_in_turn(
+        self, problem: str, site: faults.Site, references: faults.References
+    ) -> None:
+        document = faults.document_of(problem)
+        steps = faults.sensing_steps(document)
         first, second = site.service().start(), site.service().start()
-        story = Story(site, references, document)
+        story = faults.Story(site, references, document)
         story.at("begin", 0, story.seen(first), story.seen(second))
         story.at("sense", steps[1], first.kill)
         story.at("perform", steps[2], first.start, story.seen(first, 2))
@@ -177,5 +168,5 @@ class TestReplicas:
         # One of them could always be asked, so nothing else was needed.
         assert robot.statuses() == []
         assert not robot.matching("launch")
-        deciding = services_in_order(robot)
+        deciding = faults.services_in_order(robot)
         assert deciding == [first.endpoint, second.endpoint, first.endpoint, second.endpoint]

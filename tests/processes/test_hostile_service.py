@@ -9,17 +9,7 @@ import socket
 import threading
 
 from tests.ports import free_port
-from tests.processes.faults import (
-    LOCAL_RECOVERY,
-    LOST,
-    PATIENCE_S,
-    QUICK,
-    References,
-    Site,
-    Story,
-    document_of,
-    events_of,
-)
+from tests.processes import faults
 
 from holdfast.protocol.messages import with_checksum
 from holdfast.transport.frames import CALL, LAST, FrameDecoder, encode_frame, encode_hello
@@ -69,26 +59,28 @@ class HostileService:
             self._flaps.set()
             enough = self._links + FLAPS
             self._link.shutdown(socket.SHUT_RDWR)
-            assert self._changed.wait_for(lambda: self._links >= enough, PATIENCE_S)
+            assert self._changed.wait_for(lambda: self._links >= enough, faults.PATIENCE_S)
             self._flaps.clear()
 
     def close(self) -> None:
         self._listener.close()
 
 
-def test_it_cannot_fill_the_log(site: Site, references: References) -> None:
+def test_it_cannot_fill_the_log(site: faults.Site, references: faults.References) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     service = HostileService(endpoint)
     try:
-        story = Story(site, references, document_of("peg_in_hole_2d"), offload=QUICK)
-        story.at("perform", 20, story.status(LOCAL_RECOVERY), service.flap)
+        story = faults.Story(
+            site, references, faults.document_of("peg_in_hole_2d"), offload=faults.QUICK
+        )
+        story.at("perform", 20, story.status(faults.LOCAL_RECOVERY), service.flap)
         robot = story.run(endpoint)
     finally:
         service.close()
-    assert robot.statuses() == [LOST]
+    assert robot.statuses() == [faults.LOST]
     told: dict[str, list[float]] = collections.defaultdict(list)
     omitted: collections.Counter[str] = collections.Counter()
-    for event in events_of(robot.out):
+    for event in faults.events_of(robot.out):
         if event.get("service") == endpoint:
             moment = dt.datetime.fromisoformat(event["time"])
             told[event["event"]].append(moment.timestamp())

@@ -6,15 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from tests.processes.faults import (
-    LOST,
-    PATIENT,
-    RECOVERY,
-    Service,
-    Site,
-    assert_identical,
-    services_in_order,
-)
+from tests.processes import faults
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "light_dark_room.py"
 NAME = "light_dark_room:LightDarkRoom"
@@ -26,7 +18,7 @@ DOCUMENT = {
 CONSTANT, OLDER_CONSTANT = "0.0001 + 0.02 * (x * x", "0.0001 + 0.03 * (x * x"
 
 
-def older_copy(site: Site) -> Service:
+def older_copy(site: faults.Site) -> faults.Service:
     """Return a service that is given the example as it was before one constant was changed."""
     older = site.directory / "older"
     older.mkdir()
@@ -46,17 +38,17 @@ def digests_in(reason: str) -> tuple[str, str]:
 
 
 class TestOlderCopyOfTheProblem:
-    def test_it_is_refused_and_the_local_service_decides(self, site: Site) -> None:
+    def test_it_is_refused_and_the_local_service_decides(self, site: faults.Site) -> None:
         shutil.copy(EXAMPLE, site.directory)
-        file = site.configure(DOCUMENT, offload=PATIENT)
+        file = site.configure(DOCUMENT, offload=faults.PATIENT)
         alone = site.holdfast("run", file, "--out", site.directory / "alone", "--jobs", "1", "-q")
         assert alone.process.returncode == 0, alone.account()
         cloud = older_copy(site).start()
         robot = site.run(file, services=[cloud])
         robot.finish()
-        assert_identical(robot.out, site.directory / "alone")
-        assert robot.statuses() == [LOST]
-        assert set(services_in_order(robot)) == {RECOVERY}
+        faults.assert_identical(robot.out, site.directory / "alone")
+        assert robot.statuses() == [faults.LOST]
+        assert set(faults.services_in_order(robot)) == {faults.RECOVERY}
         (refused,) = robot.matching("refused")
         assert refused["service"] == cloud.endpoint
         assert refused["code"] == "other_code"
@@ -117,7 +109,7 @@ class TestWhereTheCodeIsWritten:
             for number, written in enumerate(WRITTEN_BY_A_USER)
         ],
     )
-    def test_a_change_is_refused_and_a_copy_is_not(self, site: Site, written: str) -> None:
+    def test_a_change_is_refused_and_a_copy_is_not(self, site: faults.Site, written: str) -> None:
         name, sources, constant = WRITTEN_BY_A_USER[written]
         services = []
         for place, value in (("older", "0.5"), ("same", "1.0"), ("", "1.0")):
@@ -130,8 +122,8 @@ class TestWhereTheCodeIsWritten:
                 services.append(site.service("--problem", name, "--problem-directory", folder))
         older, same = (service.start() for service in services)
         document = {**DOCUMENT, "problem": name}
-        robot = site.run(site.configure(document, offload=PATIENT), services=[older, same])
+        robot = site.run(site.configure(document, offload=faults.PATIENT), services=[older, same])
         robot.finish()
         (refused,) = robot.matching("refused")
         assert (refused["service"], refused["code"]) == (older.endpoint, "other_code")
-        assert services_in_order(robot) == [same.endpoint]
+        assert faults.services_in_order(robot) == [same.endpoint]

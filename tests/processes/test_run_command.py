@@ -155,13 +155,7 @@ class TestOutput:
         done = holdfast(workplace, "run", "peg.yaml", "--out", "out", command=WITH_FIGURES)
         assert done.returncode == 0, done.stderr
         names = {path.name for path in (workplace / "out").iterdir()}
-        assert names == {
-            "trials.csv",
-            "summary.json",
-            "config.yaml",
-            "journal.bin",
-            "trial.png",
-        }
+        assert names == {"trials.csv", "summary.json", "config.yaml", "journal.bin", "trial.png"}
         assert all(name in done.stdout for name in names)
         assert "success" in done.stdout
         assert done.stderr.splitlines() == ["peg_in_hole_2d, 6 trials, seed 3; results in out"]

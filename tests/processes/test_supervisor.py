@@ -13,19 +13,7 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from tests.ports import free_port
-from tests.processes.faults import (
-    PATIENT,
-    References,
-    Service,
-    Site,
-    assert_identical,
-    document_of,
-    events_of,
-    in_order,
-    page,
-    wait_for_end,
-    wait_until,
-)
+from tests.processes import faults
 from tests.processes.world import World
 
 PATIENCE_S = 30.0
@@ -48,11 +36,11 @@ class Mortal(CapsuleRobot):
 
 
 def several(
-    site: Site,
+    site: faults.Site,
     *options: str,
     endpoint: str | None = None,
     variables: dict[str, str] | None = None,
-) -> Service:
+) -> faults.Service:
     """Return a service of two processes that tells how it is."""
     address = f"127.0.0.1:{free_port()}"
     service = site.service(
@@ -64,12 +52,12 @@ def several(
     return service.start()
 
 
-def health_of(service: Service, path: str) -> tuple[int, str]:
+def health_of(service: faults.Service, path: str) -> tuple[int, str]:
     (ready,) = service.process.matching("ready")
-    return page(ready["health"], path)
+    return faults.page(ready["health"], path)
 
 
-def metrics(service: Service) -> dict[str, float]:
+def metrics(service: faults.Service) -> dict[str, float]:
     """Return all counts, each kind of a metric by itself."""
     status, text = health_of(service, "/metrics")
     assert status == 200
@@ -81,12 +69,12 @@ def metrics(service: Service) -> dict[str, float]:
     }
 
 
-def children(service: Service) -> list[int]:
+def children(service: faults.Service) -> list[int]:
     pid = service.process.pid
     return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
-def started_again(service: Service, count: int) -> Callable[[], object]:
+def started_again(service: faults.Service, count: int) -> Callable[[], object]:
     return lambda: service.process.wait_for("process_started", count)
 
 
@@ -97,7 +85,7 @@ class TestRobots:
         ["udp", *(pytest.param(each, marks=pytest.mark.slow) for each in ("tcp", "tls", "unix"))],
     )
     def test_processes_are_killed_under_them(
-        self, protocol: str, site: Site, keys: Path, references: References
+        self, protocol: str, site: faults.Site, keys: Path, references: faults.References
     ) -> None:
         """Their runs decide the same; nothing but time is lost, and nothing is forgotten."""
         place = site.directory / "socket" if protocol == "unix" else f"127.0.0.1:{free_port()}"
@@ -106,7 +94,7 @@ class TestRobots:
             for end in ("robot", "service")
         }
         cloud = several(site, *credentials["service"], endpoint=f"{protocol}/{place}")
-        document = document_of(PEG)
+        document = faults.document_of(PEG)
         told: list[dict[str, float]] = []
 
         def kill(index: int) -> None:
@@ -118,25 +106,25 @@ class TestRobots:
         robots = []
         for number in range(4):
             world, file = site.world(
-                document, f"robot-{number}", offload=PATIENT, recovery={"launch": "never"}
+                document, f"robot-{number}", offload=faults.PATIENT, recovery={"launch": "never"}
             )
             worlds.append(world)
             if number == 0:
-                world.on("perform", 20, in_order(lambda: kill(0), started_again(cloud, 1)))
-                world.on("sense", 36, in_order(lambda: kill(1), started_again(cloud, 2)))
-                world.on("perform", 50, in_order(lambda: kill(0), lambda: kill(-1)))
+                world.on("perform", 20, faults.in_order(lambda: kill(0), started_again(cloud, 1)))
+                world.on("sense", 36, faults.in_order(lambda: kill(1), started_again(cloud, 2)))
+                world.on("perform", 50, faults.in_order(lambda: kill(0), lambda: kill(-1)))
             robots.append(
                 site.run(file, *credentials["robot"], services=[cloud], out=f"out-{number}")
             )
         for robot, world in zip(robots, worlds, strict=True):
             robot.finish()
             world.check()
-            assert_identical(robot.out, references(document))
+            faults.assert_identical(robot.out, references(document))
             world.assert_each_once(references(document))
-            assert not [each for each in events_of(robot.out) if each["event"] == "launch"]
+            assert not [each for each in faults.events_of(robot.out) if each["event"] == "launch"]
         decisions = "holdfast_decisions_total[('kind', 'sensing')]"
         # The processes that the last robots have met report every second.
-        wait_until(lambda: metrics(cloud)[decisions] > 0, "the decisions to be told")
+        faults.wait_until(lambda: metrics(cloud)[decisions] > 0, "the decisions to be told")
         told.append(metrics(cloud))
         for before, after in itertools.pairwise(told):
             for name, value in before.items():
@@ -159,14 +147,14 @@ class TestEnding:
             pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
         ],
     )
-    def test_in_order(self, site: Site, number: signal.Signals, code: int) -> None:
+    def test_in_order(self, site: faults.Site, number: signal.Signals, code: int) -> None:
         cloud = several(site)
         pids = children(cloud)
         assert len(pids) == 2
         cloud.process.signal(number)
         assert cloud.process.wait() == code, cloud.process.account()
         for pid in pids:
-            wait_for_end(pid)
+            faults.wait_for_end(pid)
         (stopping,) = cloud.process.matching("stopping")
         assert stopping["reason"] == number.name
         assert "Traceback" not in cloud.process.output
@@ -174,14 +162,14 @@ class TestEnding:
             host, _, port = cloud.endpoint.removeprefix("tcp/").rpartition(":")
             again.bind((host, int(port)))
 
-    def test_processes_end_with_the_supervisor(self, site: Site) -> None:
+    def test_processes_end_with_the_supervisor(self, site: faults.Site) -> None:
         cloud = several(site)
         pids = children(cloud)
         cloud.kill()
         for pid in pids:
-            wait_for_end(pid)
+            faults.wait_for_end(pid)
 
-    def test_a_second_signal_ends_at_once(self, site: Site) -> None:
+    def test_a_second_signal_ends_at_once(self, site: faults.Site) -> None:
         """A process that stands still cannot end in order, and would be waited for."""
         cloud = several(site)
         pids = children(cloud)
@@ -191,11 +179,11 @@ class TestEnding:
         cloud.process.signal(signal.SIGTERM)
         cloud.process.wait()
         for pid in pids:
-            wait_for_end(pid)
+            faults.wait_for_end(pid)
 
 
 class TestHealth:
-    def test_a_process_that_cannot_be_started_again(self, site: Site) -> None:
+    def test_a_process_that_cannot_be_started_again(self, site: faults.Site) -> None:
         """Each time it is started a little later; as soon as it can serve, it does."""
         (site.directory / "mortal_problem.py").write_text(MORTAL)
         options = ("--problem", "mortal_problem:Mortal", "--problem-directory", str(site.directory))
@@ -220,7 +208,7 @@ class TestHealth:
 
 
 class TestRefusing:
-    def refused(self, site: Site, *options: str) -> str:
+    def refused(self, site: faults.Site, *options: str) -> str:
         """Return the one line with which a service of several processes is not started."""
         ended = site.process(
             *site.service().command, "serve", "--processes", "2", "--log", "json", *options
@@ -231,7 +219,7 @@ class TestRefusing:
         assert error.name == "error"
         return json.dumps(dict(error.fields))
 
-    def test_an_address_that_is_taken(self, site: Site) -> None:
+    def test_an_address_that_is_taken(self, site: faults.Site) -> None:
         with socket.socket() as taken:
             taken.bind(("127.0.0.1", free_port()))
             taken.listen()

@@ -7,14 +7,7 @@ from pathlib import Path
 
 import pytest
 from tests.ports import free_port
-from tests.processes.faults import (
-    References,
-    Service,
-    Site,
-    Story,
-    document_of,
-    sensing_steps,
-)
+from tests.processes.faults import References, Service, Site, Story, document_of, sensing_steps
 
 from holdfast_lab.testbed.bad_line import Carrier, Direction, Impairment
 from holdfast_lab.testbed.proxy import Proxy

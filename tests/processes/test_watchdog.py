@@ -9,16 +9,7 @@ from pathlib import Path
 
 import pytest
 from tests.ports import free_port
-from tests.processes.faults import (
-    LOCAL_RECOVERY,
-    References,
-    Service,
-    Site,
-    Story,
-    document_of,
-    page,
-    wait_until,
-)
+from tests.processes import faults
 
 from holdfast.runtime.watchdog import EXIT_STUCK
 
@@ -37,7 +28,7 @@ signal.signal(signal.SIGUSR1, stand_still)
 """
 
 
-def stuck_by_signal(site: Site) -> dict[str, str]:
+def stuck_by_signal(site: faults.Site) -> dict[str, str]:
     """Return the variables of a process that a signal makes stand still."""
     (site.directory / "sitecustomize.py").write_text(STANDS_STILL)
     return {"PYTHONPATH": str(site.directory)}
@@ -47,7 +38,7 @@ def children_of(pid: int) -> list[int]:
     return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
-def watched(site: Site, *options: str) -> Service:
+def watched(site: faults.Site, *options: str) -> faults.Service:
     cloud = site.service(*WATCHED, "--health", f"127.0.0.1:{free_port()}", *options)
     cloud.variables = stuck_by_signal(site)
     return cloud.start()
@@ -55,11 +46,11 @@ def watched(site: Site, *options: str) -> Service:
 
 @pytest.mark.parametrize("processes", [1, 2])
 def test_a_service_that_is_stuck_ends_and_its_robot_goes_on(
-    processes: int, site: Site, references: References
+    processes: int, site: faults.Site, references: faults.References
 ) -> None:
     cloud = watched(site, *(() if processes == 1 else ("--processes", str(processes))))
     (ready,) = cloud.process.matching("ready")
-    story = Story(site, references, document_of(PEG))
+    story = faults.Story(site, references, faults.document_of(PEG))
 
     def stick() -> None:
         for each in [cloud.process.pid] if processes == 1 else children_of(cloud.process.pid):
@@ -73,14 +64,18 @@ def test_a_service_that_is_stuck_ends_and_its_robot_goes_on(
         else:
             ended = cloud.process.wait_for("process_ended", processes)
             assert ended["reason"] == f"ended with exit code {EXIT_STUCK}"
-            wait_until(lambda: page(ready["health"], "/readyz") == (200, "ok\n"), "it to serve")
+            faults.wait_until(
+                lambda: faults.page(ready["health"], "/readyz") == (200, "ok\n"), "it to serve"
+            )
 
-    story.at("perform", 20, stick, story.status(LOCAL_RECOVERY))
+    story.at("perform", 20, stick, story.status(faults.LOCAL_RECOVERY))
     story.finish(site.run(story.file, services=[cloud]))
 
 
-def test_a_robot_that_is_stuck_is_started_again(site: Site, references: References) -> None:
-    story = Story(site, references, document_of(PEG))
+def test_a_robot_that_is_stuck_is_started_again(
+    site: faults.Site, references: faults.References
+) -> None:
+    story = faults.Story(site, references, faults.document_of(PEG))
 
     def stick() -> None:
         (robot,) = children_of(story.running.pid)
@@ -96,7 +91,7 @@ def test_a_robot_that_is_stuck_is_started_again(site: Site, references: Referenc
     story.finish(robot)
 
 
-def test_what_was_stopped_for_longer_than_that_goes_on(site: Site) -> None:
+def test_what_was_stopped_for_longer_than_that_goes_on(site: faults.Site) -> None:
     """As on a machine that sleeps, and in a container that is paused."""
     cloud = watched(site)
     (ready,) = cloud.process.matching("ready")
@@ -104,7 +99,7 @@ def test_what_was_stopped_for_longer_than_that_goes_on(site: Site) -> None:
         cloud.stop()
         time.sleep(2.0 * LIMIT_S)
         cloud.resume()
-        assert page(ready["health"], "/livez") == (200, "ok\n")
+        assert faults.page(ready["health"], "/livez") == (200, "ok\n")
     assert cloud.process.matching("stuck") == []
     # And it still watches.
     cloud.process.signal(signal.SIGUSR1)

@@ -8,12 +8,7 @@ import numpy as np
 
 from holdfast.config.loader import Configuration, load
 from holdfast.planning.planner import Planner
-from holdfast_ros.active_sensing import (
-    ActiveSensing,
-    DecisionRequest,
-    ErrorCode,
-    RequestKind,
-)
+from holdfast_ros.active_sensing import ActiveSensing, DecisionRequest, ErrorCode, RequestKind
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
 

@@ -39,7 +39,9 @@ def test_in_brief(values: object, text: str) -> None:
 
 
 def test_a_ragged_list_is_cut() -> None:
-    assert len(in_brief([[0], list(range(1000))])) == 80
+    shown = in_brief([[0], list(range(1000))])
+    assert shown.startswith("[[0], [0, 1, 2, 3,")
+    assert shown.endswith("18, 19,...")
 
 
 HIDDEN = np.ma.array([1.0, 2.0], mask=[False, True])

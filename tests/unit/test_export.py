@@ -730,13 +730,15 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ((), "nothing to write: give --mcap FILE or --csv DIR, or both"),
+            ((), "nothing to write: give --mcap FILE, --csv DIR or --figure FILE"),
             (("--csv", "there"), "there: holds files already; remove it, or choose another"),
             (("--csv", "run.yaml"), "run.yaml: exists already; remove it, or choose another"),
             (("--mcap", "there"), "there: exists already"),
             (("--mcap", "no/run.mcap"), "there is no directory no"),
             (("--csv", "one", "--mcap", "one"), "--mcap and --csv are both one; give two places"),
-            (("--csv", "one", "--trials", "5"), "--trials is '5'; allowed are two whole numbers"),
+            (("--csv", "one", "--trials", "5:"), "--trials is '5:'; allowed are one trial N, or"),
+            (("--csv", "one", "--trials", "5"), "has no trial 5 (--trials); it has 2 trials"),
+            (("--figure", "one.gif"), "--figure is 'one.gif'; allowed are names that end with .pd"),
             (("--csv", "one", "--trials", "2:9"), "has no trial from 2 to 8 (--trials); it has 2"),
         ],
     )

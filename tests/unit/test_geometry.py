@@ -16,11 +16,7 @@ World = DiscWorld | RectangleWorld | BoxWorld
 
 fresh = partial(stream, 20, 1, 2, Purpose.PREDICTION)  # anew at each call
 GROUND = [(-FAR, -FAR, FAR, 0.0)]
-SLOT = [
-    (-FAR, -FAR, -0.6, 0.0),
-    (0.6, -FAR, FAR, 0.0),
-    (-0.6, -FAR, 0.6, -1.1),
-]
+SLOT = [(-FAR, -FAR, -0.6, 0.0), (0.6, -FAR, FAR, 0.0), (-0.6, -FAR, 0.6, -1.1)]
 SLOT_3D = [
     (-FAR, -FAR, -FAR, -0.6, FAR, 0.0),
     (0.6, -FAR, -FAR, FAR, FAR, 0.0),

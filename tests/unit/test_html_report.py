@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 import sys
@@ -58,7 +59,8 @@ def test_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page, notes = run_page(run, worst=2, on_trial=done.append)
     assert (notes, done) == ([], [1, 2])
     text = page.decode()
-    for words in ("of 3 trials succeeded", "success (%)", "holdfast run config.yaml", "NumPy"):
+    again = "config.yaml; then:</p>\n<pre>holdfast run config.yaml --out again\n"
+    for words in ("of 3 trials succeeded", "success (%)", again, "NumPy"):
         assert words in text
     trials, timeline, *shown = charts_of(page)
     assert [each["trial"] for each in trials["data"]["values"]] == [0, 1, 2]
@@ -92,6 +94,8 @@ def test_code_that_a_run_names_is_not_run(
     assert len(charts_of(page)) == 1
     page, notes = run_page(tmp_path / "out", worst=1, problem_directory=tmp_path)
     assert (notes, len(charts_of(page))) == ([], 2)
+    assert b"config.yaml, and beside it the module own; then:" in page
+    assert b"holdfast run config.yaml --problem-directory . --out again" in page
     with (tmp_path / "own.py").open("a") as module:
         module.write("    def scene(self):\n        return 1 / 0\n")
     sys.modules.pop("own")
@@ -119,6 +123,64 @@ def test_runs_a_sweep_and_a_study(tmp_path: Path, capsys: pytest.CaptureFixture[
     (tmp_path / "nothing" / "table.csv").write_text("run,measure,effect,low,high\na,x,1,0,2\n")
     (tmp_path / "nothing" / "sweep.json").write_text("{}")
     assert len(charts_of(results_page(tmp_path / "nothing")[0])) == 1
+
+
+def test_a_report_replaces_a_report_and_nothing_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recorded(tmp_path, capsys)
+    report = ["report", "out", "--out", "sent.html", "--worst"]
+    assert run_here(capsys, tmp_path, *report, "0").code == 0
+    first = (tmp_path / "sent.html").read_bytes()
+    assert run_here(capsys, tmp_path, *report, "1").code == 0
+    assert len((tmp_path / "sent.html").read_bytes()) > len(first)
+    (tmp_path / "sent.html").rename(tmp_path / "real.html")
+    (tmp_path / "sent.html").symlink_to("real.html")
+    for _ in range(2):
+        said = run_here(capsys, tmp_path, *report, "0")
+        assert (said.code, "and holdfast did not write it; remove it" in said.stderr) == (2, True)
+        (tmp_path / "sent.html").unlink()
+        (tmp_path / "sent.html").write_text("my thesis")
+    assert (tmp_path / "sent.html").read_text() == "my thesis"
+
+
+def test_a_run_is_repeated_on_another_machine(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the command that the report prints."""
+    here, there = tmp_path / "here", tmp_path / "there"
+    for place in (here, there):
+        place.mkdir()
+        (place / "copied.py").write_text(OWN)
+    (here / "own.yaml").write_text(
+        PEG.replace("peg_in_hole_2d", "copied:Own").replace("num_trials: 3", "num_trials: 1")
+        + "environment: {object: 'copied:Robot'}\n"
+    )
+    assert run_here(capsys, here, "run", "own.yaml", "--out", "out").code == 0
+    page, _ = run_page(here / "out")
+    found = re.search("<pre>holdfast (run config.yaml .*)\n", page.decode())
+    assert found is not None
+    (there / "config.yaml").write_text((here / "out" / "config.yaml").read_text())
+    (here / "copied.py").unlink()
+    said = run_here(capsys, there, "run", "config.yaml", "--out", "again")
+    assert (said.code, "this machine: --problem-directory DIR" in said.stderr) == (2, True)
+    said = run_here(capsys, there, *html.unescape(found[1]).split())
+    assert said.code == 0, said.stderr
+    assert run_here(capsys, tmp_path, "compare", "here/out", "there/again").code == 0
+    settings = (there / "again" / "config.yaml").read_text()
+    assert f"problem_directory: {there}\n" in settings
+
+
+OWN = """
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.robot.environment import SimulatedEnvironment
+
+class Own(PegInHole2D):
+    pass
+
+class Robot(SimulatedEnvironment):
+    pass
+"""
 
 
 def test_the_worst_come_first() -> None:

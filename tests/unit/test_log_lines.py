@@ -42,13 +42,7 @@ EXAMPLES: dict[str, dict[str, object]] = {
     "resumed": {"held_ms": 812.0},
     "refused": {"service": "cloud", "code": "stale_epoch", "reason": "epoch 1 < 2", "final": True},
     "disagreement": {"service": "cloud", "kind": "sensing"},
-    "trial": {
-        "trial": 3,
-        "success": True,
-        "outcome": "succeeded",
-        "steps": 41,
-        "warm": False,
-    },
+    "trial": {"trial": 3, "success": True, "outcome": "succeeded", "steps": 41, "warm": False},
     "missed_ticks": {"missed": 2, "total": 5},
     "ready": {"endpoints": ["tcp/127.0.0.1:7447"], "idle_s": 0.25},
     "session_opened": {"session": b"\xab" * 16},
@@ -117,10 +111,7 @@ class TestText:
     @pytest.mark.parametrize(
         ("name", "expected"),
         [
-            (
-                "status",
-                "standard -> local_recovery (cloud is gone: link broken), trial 3, 12.3 ms",
-            ),
+            ("status", "standard -> local_recovery (cloud is gone: link broken), trial 3, 12.3 ms"),
             ("launched", "launch 242 ms"),
             ("launch_failed", "not seen after 5000 ms"),
             ("retry", "cloud, retry in 2.50 ms"),

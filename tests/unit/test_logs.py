@@ -159,11 +159,4 @@ class TestTargets:
         )
         loaded = set(done.stdout.split())
         assert "holdfast.runtime.logs" in loaded
-        assert not loaded & {
-            "logging",
-            "pickle",
-            "numpy",
-            "rich",
-            "prometheus_client",
-            "yaml",
-        }
+        assert not loaded & {"logging", "pickle", "numpy", "rich", "prometheus_client", "yaml"}

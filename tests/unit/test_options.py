@@ -111,14 +111,8 @@ def test_an_empty_path_is_not_the_current_directory(
             ["serve", "--listen", "tcp/0.0.0.0:1"],
             "--listen: endpoint tcp/0.0.0.0:1: other machines",
         ),
-        (
-            ["run", "peg.yaml", "--log", "jsno"],
-            "allowed are text and json; did you mean json?",
-        ),
-        (
-            ["run", "peg.yaml", "--trails", "3"],
-            "no option of holdfast run; did you mean --trials?",
-        ),
+        (["run", "peg.yaml", "--log", "jsno"], "allowed are text and json; did you mean json?"),
+        (["run", "peg.yaml", "--trails", "3"], "no option of holdfast run; did you mean --trials?"),
         (["run", "peg.yaml", "--quiet=3"], "--quiet takes no value"),
         (["view", "run", "--viewer", "a/b"], "--viewer is 'a/b'; allowed are HOST, HOST:PORT or"),
         (["keys", "mine", "--revoke-serial", "xyz"], "--revoke-serial is 'xyz'; allowed are hex"),

@@ -101,11 +101,7 @@ def test_what_was_asked_before_and_not_begun_is_not_computed(
     state = planner.init(3, 0)
     come: list[int] = []
     own = OwnPlanner(
-        lambda: planner,
-        repr,
-        lambda planned: come.append(planned.number),
-        _fail,
-        may_be_brief=True,
+        lambda: planner, repr, lambda planned: come.append(planned.number), _fail, may_be_brief=True
     )
     own._usual["sensing"].learn(0.0)
     own.ask(ComputeOwnAnswer(1, state, part="sensing"))

@@ -13,7 +13,7 @@ from msgspec import structs
 from holdfast.cli import _print_defect, main
 from holdfast.cli.terminal import print_summary, progress_line
 from holdfast.journal.tables import SummaryBuilder
-from holdfast.printable import cell, one_line, printable
+from holdfast.printable import brief, cell, one_line, printable
 from holdfast.protocol.messages import Refused, decode_reply, encode
 from holdfast.runtime.log_lines import json_line, text_line
 from holdfast.runtime.logs import EventLog
@@ -30,6 +30,23 @@ def test_what_is_shown() -> None:
 
 
 FORGED = "busy\n2026-01-01 robot status  up\x85\u2028\u2029\x1c\r\x0b ok \u061c\U000e0001\u202e"
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        ("short", "'short'"),
+        ([1.25] * 30, f"[{'1.25, ' * 11}1.25,..."),
+        ("a b\n" * 40, f"'{'a b' + chr(92) + 'na b' + chr(92) + 'n'}"),
+        ("x" * 90, f"'{'x' * 76}..."),
+        (Path("/home/me/deep") / ("d/" * 40) / "run.yaml", "PosixPath('/home/me/.../d/d/"),
+    ],
+)
+def test_a_long_value_is_cut_between_words(value: object, shown: str) -> None:
+    assert brief(value).startswith(shown)
+    assert len(brief(value)) <= 80
+    if isinstance(value, Path):
+        assert brief(value).endswith("/run.yaml')")
 
 
 def test_what_a_peer_says_is_one_line() -> None:

@@ -460,6 +460,17 @@ def test_prices_that_nobody_weighs() -> None:
     (found,) = [each for each in check(Priced()) if each.check == "prices"]
     assert found.severity == W
     assert "path_entropy does not weigh them: selector.nats_per_cost is 0" in found.seen
+    page = (Path(__file__).parents[2] / "docs" / "problems.md").read_text(encoding="utf-8")
+    cases: Any = (
+        ("path_entropy", "1.04 (the nats", "1.5 log 2 = 1.04 / P"),
+        ("action_entropy", "0.69 (the nats", "log 2 = 0.69 nats"),
+        ("action_covariance", "how much smaller the trace", "(the trace) plus `nats_per_cost`"),
+    )
+    for method, worth, written in cases:
+        own = check(Priced(), settings=PlanningSettings(selector=SelectorSettings(method=method)))
+        (advice,) = [each.advice for each in own if each.check == "prices"]
+        assert f"Set selector.nats_per_cost to {worth}" in advice
+        assert written in page
     for selector in (
         SelectorSettings(nats_per_cost=0.1),
         SelectorSettings(method="expected_return"),

@@ -71,6 +71,7 @@ from holdfast.problems.problem import (
         ("circular_observations", ((0,), 1), r"circular_observations\[1\] of line is 1: must be"),
         ("circular_observations", ((0,), (-1,)), r"circular_observations\[1\] of line is"),
         ("motion_variance", [[1], [1, 2]], r"motion_variance of line is .*: must be 1 numbers"),
+        ("rank_test", "no", "rank_test of line is 'no': must be True or False"),
         ("resolution", True, "resolution of line is True: must be one number"),
         ("motion_variance", np.array([0.1, 0.1]), "motion_variance of line"),
         ("log_likelihood", lambda *_: 0.0, "log_likelihood alone"),

@@ -81,6 +81,15 @@ class TestProblemBase:
         ({"obstacles": [1, 2, 3]}, r"obstacles of a Scene .* must be \(any number, 4\)"),
         ({"obstacles": [[1, 2, 3, 4], [1, 2]]}, "obstacles of a Scene is .*: must be numbers"),
         ({"body": [[1, 2], [3]]}, "body of a Scene is .*: must be numbers"),
+        ({"limits": None}, r"limits of a Scene is None: must be numbers, of the shape \(4\)"),
+        ({"limits": (0, 1, 2, 1)}, r"limits of a Scene is \(0, 1, 2, 1\): must be finite x_min"),
+        ({"axes": None}, r"axes of a Scene is None: must be two coordinates of the state, such as"),
+        ({"axes": (0, 1.5)}, r"axes of a Scene is \(0, 1.5\): must be two coordinates"),
+        ({"angle": "yaw"}, "angle of a Scene is 'yaw': must be a coordinate of the state"),
+        ({"targets": None}, r"targets of a Scene is None: must be pairs .* such as \[\(2, 3\)\]"),
+        ({"targets": [(0, None)]}, r"targets of a Scene is \[\(0, None\)\]: must be pairs"),
+        ({"walls": None}, "walls of a Scene is None: must be coordinates that move rectangles"),
+        ({"walls": [(0, 1)]}, r"walls of a Scene is \[\(0, 1\)\]: must be coordinates that"),
     ],
 )
 def test_a_scene_says_what_does_not_fit(arguments: dict[str, Any], words: str) -> None:
@@ -92,6 +101,8 @@ def test_a_scene_without_points_or_obstacles() -> None:
     scene = Scene((0, 1), (0, 0, 1, 1), obstacles=[], points=[])
     assert scene.points is not None
     assert (scene.obstacles.shape, scene.points.shape) == ((0, 4), (0, 2))
+    scene = Scene(np.array([0, 1]), (0, 0, 1, 1), angle=np.int64(2), targets=np.array([[0, 1]]))  # type: ignore[arg-type]
+    assert (scene.axes, scene.angle, scene.targets) == ((0, 1), 2, [(0, 1)])
 
 
 @pytest.mark.parametrize(

@@ -101,12 +101,7 @@ class TestMake:
                 "rotation_step_size is .*; expected a number",
             ),
             ("peg_in_hole_2d", {"width": 1}, InvalidValueError, "no setting .width."),
-            (
-                "studies.busy_room:BusyRoom",
-                {"width": 1},
-                ProblemError,
-                "BusyRoom cannot be built",
-            ),
+            ("studies.busy_room:BusyRoom", {"width": 1}, ProblemError, "BusyRoom cannot be built"),
         ],
     )
     def test_refusals(

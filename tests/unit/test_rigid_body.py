@@ -11,11 +11,7 @@ from holdfast.problems.multitier_peg_in_hole_2d import MultitierPegInHole2D
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.peg_in_hole_3d import PegInHole3D
 
-PEGS: list[tuple[type[Any], int]] = [
-    (PegInHole2D, 2),
-    (MultitierPegInHole2D, 2),
-    (PegInHole3D, 3),
-]
+PEGS: list[tuple[type[Any], int]] = [(PegInHole2D, 2), (MultitierPegInHole2D, 2), (PegInHole3D, 3)]
 """With the number of coordinates of a translation; those after it are angles."""
 
 

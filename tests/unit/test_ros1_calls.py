@@ -13,13 +13,7 @@ import pytest
 from tests.ports import free_port
 
 from ros1_master_guard.errors import CallError, GoneError, SilentError
-from ros1_master_guard.ros1_calls import (
-    CALLER,
-    MAX_SHORT_BYTES,
-    Connection,
-    call,
-    decoded,
-)
+from ros1_master_guard.ros1_calls import CALLER, MAX_SHORT_BYTES, Connection, call, decoded
 
 PATIENCE_S = 20.0
 SHORT_S = 0.05

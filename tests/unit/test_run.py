@@ -335,6 +335,57 @@ def test_a_problem_is_no_file(workplace: Workplace) -> None:
     assert "'problem: capsule_robot' is enough" in error
 
 
+def test_what_is_nearly_a_file_is_suggested(workplace: Workplace) -> None:
+    assert workplace.fails("run", "pegg.yaml").endswith("no such file; did you mean peg.yaml?\n")
+    assert "'problem: lamps:Room' is enough" in workplace.fails("run", "lamps:Room")
+    (workplace.directory / "lamps.py").write_text("")
+    error = workplace.fails("run", "lamps.py")
+    assert "lamps.py: is Python; lamps:CLASS is a problem, and a run needs" in error
+
+
+LICENSED = """
+from pathlib import Path
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+
+class Licensed(PegInHole2D):
+    def __init__(self, *settings):
+        if not Path("licence").exists():
+            raise RuntimeError("no licence")
+        super().__init__(*settings)
+"""
+
+
+@pytest.mark.parametrize(
+    "command", [["run", "--trials", "2"], ["sweep", "--set", "selector.method=random,fixed"]]
+)
+def test_a_constructor_that_fails_in_what_is_resumed_ends_with_the_command(
+    command: list[str], workplace: Workplace
+) -> None:
+    (workplace.directory / "licensed.py").write_text(LICENSED)
+    text = (
+        (workplace.directory / "peg.yaml")
+        .read_text()
+        .replace("peg_in_hole_2d", "licensed:Licensed")
+    )
+    (workplace.directory / "own.yaml").write_text(text)
+    licence = workplace.directory / "licence"
+    name, *options = command
+    words = [name, "own.yaml", *options, "--out", "out"]
+    said = workplace.run(*words)
+    assert (said.code, "no licence" in said.stderr, "Go on" in said.stderr) == (2, True, False)
+    licence.touch()
+    assert workplace.run(*words, "--quiet").code == 0
+    licence.unlink()
+    said = workplace.run(*words, "--resume", "--quiet")
+    again = said.stderr.rpartition("\nGo on with: holdfast ")[2].split()
+    assert (said.code, sorted(again)) == (4, sorted([*words, "--resume"])), said.stderr
+    # Another mistake than the code's would be made again.
+    said = workplace.run(*words, "--resume", "--set", "selector.actions=none")
+    assert (said.code, "Go on" in said.stderr) == (2, False)
+    licence.touch()
+    assert workplace.run(*again).code == 0
+
+
 def test_too_few_particles_are_noted(workplace: Workplace) -> None:
     options = ("--trials", "2", "--set", "particle_filter.num_particles=10")
     said = workplace.runs("run", "peg.yaml", "--out", "few", *options)

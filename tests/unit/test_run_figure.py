@@ -44,6 +44,37 @@ def test_a_figure_of_this_run_and_of_an_earlier_one(
     assert figure.read_bytes().startswith(b"\x89PNG\r\n")
 
 
+def test_the_figure_of_any_trial_in_three_formats(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "peg.yaml").write_text(PEG.replace("num_trials: 1", "num_trials: 3"))
+    assert run_here(capsys, tmp_path, "run", "peg.yaml", "--jobs", "1", "--out", "out").code == 0
+    drawn = {}
+    for name, trials, beginning in (
+        ("one.pdf", "1", b"%PDF"),
+        ("one.png", "1", b"\x89PNG"),
+        ("one.svg", "1", b"<?xml"),
+        ("again.svg", "1:3", b"<?xml"),
+        ("again.pdf", "1:3", b"%PDF"),
+        ("two.svg", "2", b"<?xml"),
+    ):
+        words = ["export", "out", "--figure", name, "--trials", trials]
+        said = run_here(capsys, tmp_path, *words, figures=True)
+        assert (said.code, name in said.stdout) == (0, True), said.stderr
+        drawn[name] = (tmp_path / name).read_bytes()
+        assert drawn[name].startswith(beginning)
+    for kind in ("svg", "pdf"):  # the first of the trials, whenever it is drawn
+        assert drawn[f"one.{kind}"] == drawn[f"again.{kind}"]
+    assert drawn["one.svg"] != drawn["two.svg"]
+    for words, message in (
+        (["--figure", "new.png"], "matplotlib is not installed"),
+        (["--figure", "one.png"], "one.png: exists already; remove it"),
+        (["--figure", "x.svg", "--csv", "x.svg"], "x.svg is given twice; give two places"),
+    ):
+        said = run_here(capsys, tmp_path, "export", "out", *words, figures="new.png" not in words)
+        assert (said.code, message in said.stderr) == (2, True), said.stderr
+
+
 def test_without_matplotlib_a_note_says_so(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

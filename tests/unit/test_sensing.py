@@ -110,12 +110,7 @@ class TestBlindChoices:
         chosen = np.array(
             [
                 choose_sensing_action(
-                    problem,
-                    settings,
-                    belief,
-                    0,
-                    HYPOTHESES,
-                    stream(42, 0, step, Purpose.SELECTION),
+                    problem, settings, belief, 0, HYPOTHESES, stream(42, 0, step, Purpose.SELECTION)
                 )[0]
                 for step in range(steps)
             ]
@@ -390,10 +385,7 @@ class TestBadInput:
             state_resolution = np.array([0.1, 0.5])
 
         for estimator in ("nearest_neighbor", "gaussian_mixture_upper"):
-            selector = SelectorSettings(
-                method="state_entropy",
-                estimator=estimator,
-            )
+            selector = SelectorSettings(method="state_entropy", estimator=estimator)
             same = msgspec.structs.replace(selector, resolution=(0.1, 0.5))
             self.assert_same_entropies(OfStates(), selector, same)
 

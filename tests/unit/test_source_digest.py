@@ -233,14 +233,7 @@ class TestCore:
         rooms = (PACKAGE / room for room in ("numerics", "planning", "problems"))
         assert folders == {PACKAGE, *rooms}
 
-    @pytest.mark.parametrize(
-        "changed",
-        [
-            "planning/sensing.py",
-            "config/problem_builder.py",
-            None,
-        ],
-    )
+    @pytest.mark.parametrize("changed", ["planning/sensing.py", "config/problem_builder.py", None])
     def test_a_changed_source(self, changed: str | None, tmp_path: Path) -> None:
         """An installation is copied, and asked for its version as a process of its own."""
         shutil.copytree(

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from holdfast.cli.exit_codes import EXIT_ERROR
 from holdfast.errors import HoldfastError, OptionError
+from holdfast.printable import brief
 
 
 class Command(NamedTuple):
@@ -40,13 +41,7 @@ COMMANDS = {
 
 _LAB = "holdfast-lab", "./lab"
 _ROS = "holdfast-ros", "./ros/ros1_master_guard ./ros/holdfast_ros"
-_ELSEWHERE = {
-    "demo": _LAB,
-    "simulate": _LAB,
-    "chaos": _LAB,
-    "ros1-guard": _ROS,
-    "ros1-serve": _ROS,
-}
+_ELSEWHERE = {"demo": _LAB, "simulate": _LAB, "chaos": _LAB, "ros1-guard": _ROS, "ros1-serve": _ROS}
 """Which package of this project adds a command, and its folders, for whoever lacks it."""
 
 _OVERWRITTEN = (
@@ -118,7 +113,7 @@ def find_command(arguments: Sequence[str]) -> FoundCommand:
     names = [*COMMANDS, *added]
     hint = close_match(first, [*names, "--help", "--version"])
     hint = hint or f"; commands are {', '.join(names)}"
-    raise OptionError(f"{first!r:.80} is no {what}{hint}")
+    raise OptionError(f"{brief(first)} is no {what}{hint}")
 
 
 def _in_module(module: ModuleType) -> FoundCommand:

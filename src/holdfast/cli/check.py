@@ -12,19 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals
-from holdfast.errors import ConfigurationError, InvalidValueError
+from holdfast.errors import ConfigurationError
 from holdfast.printable import printable
-from holdfast.runtime.command_line import (
-    MAX_SEED,
-    MAX_TRIALS,
-    Options,
-    argument,
-    flag,
-    location,
-    number,
-    option,
-    whole_number,
-)
+from holdfast.runtime import command_line
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
@@ -33,7 +23,7 @@ if TYPE_CHECKING:
 _WIDEST = 110
 
 
-class CheckOptions(Options):
+class CheckOptions(command_line.Options):
     """Check a problem: its functions, its likelihoods, its goal, its sensors and its resolution.
 
     PROBLEM is a configuration file, a registered name, or module:Class of a module in the current
@@ -47,38 +37,37 @@ class CheckOptions(Options):
     exit_codes: ClassVar = {0: "no error, perhaps warnings", 1: "an error in the problem"}
     needs_arguments = True
 
-    problem: str = argument("PROBLEM", "Configuration file, name, or module:Class.")
-    assignments: tuple[str, ...] = option(
-        "--set",
-        metavar="SECTION.KEY=VALUE",
-        many=True,
-        help="A value instead of the file's, or of the default, as YAML: model.width=0.3.",
+    problem: str = command_line.argument("PROBLEM", "Configuration file, name, or module:Class.")
+    assignments: tuple[str, ...] = command_line.set_option(
+        "model.width=0.3", instead_of="the file's, or of the default"
     )
-    problem_directory: Path | None = option(
+    problem_directory: Path | None = command_line.option(
         metavar="DIR",
-        read=location,
+        read=command_line.location,
         help="Where the module of module:Class is (default: here, or where the file says).",
     )
-    seed: int = option(
+    seed: int = command_line.option(
         metavar="S",
-        read=whole_number(0, MAX_SEED),
+        read=command_line.whole_number(0, command_line.MAX_SEED),
         default=0,
         help="Names all random draws; the same seed finds the same.",
     )
-    budget: float = option(
+    budget: float = command_line.option(
         metavar="SECONDS",
-        read=number(0.1, 86_400.0, "s"),
+        read=command_line.number(0.1, 86_400.0, "s"),
         default=20.0,
         help="Time after which no further work is begun; most problems need a few seconds.",
     )
-    trials: int = option(
+    trials: int = command_line.option(
         metavar="N",
-        read=whole_number(0, MAX_TRIALS),
+        read=command_line.whole_number(0, command_line.MAX_TRIALS),
         default=100,
         help="Pairs of trials, at most, to tell whether the method beats random sensing.",
     )
-    json: bool = flag(help="Print each finding as a JSON object, one a line.")
-    quiet: bool = flag("-q", help="Show no progress, and no information: errors and warnings only.")
+    json: bool = command_line.flag(help="Print each finding as a JSON object, one a line.")
+    quiet: bool = command_line.flag(
+        "-q", help="Show no progress, and no information: errors and warnings only."
+    )
 
 
 @ended_by_signals()
@@ -125,24 +114,18 @@ def _configuration(
     """Return the configuration of a file, or one of defaults for a problem's name."""
     from holdfast.cli.overrides import combined, parse_assignment
     from holdfast.config.loader import Configuration, load
+    from holdfast.config.source import put_at
 
     given = combined(parse_assignment(each) for each in assignments)
     if problem.endswith((".yaml", ".yml")) or Path(problem).is_file():
         if directory is not None:
-            raise InvalidValueError(
-                "--problem-directory goes with module:Class; a configuration file has the key "
-                "problem_directory"
-            )
+            given["problem_directory"] = str(directory)
         return load(Path(problem).absolute(), overrides=given)
     sections: dict[str, object] = {"problem": problem}
     if directory is not None:
         sections["problem_directory"] = str(directory)
     for name, value in given.items():
-        section, _, key = name.partition(".")
-        own = sections.setdefault(section, {})
-        if not isinstance(own, dict):
-            raise InvalidValueError(f"--set {name}: {section} has no keys")
-        own[key] = value
+        put_at(sections, name, value)
     path = str(Path.cwd() / problem.replace("/", "_"))
     try:
         return Configuration.from_plain({"path": path, "configuration": sections})

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import signal
 import sys
 from collections.abc import Iterator, Sequence
 
 from holdfast.errors import HoldfastError, RunError
 from holdfast.printable import printable
-from holdfast.runtime.command_line import wants_json
+from holdfast.runtime.command_line import Options, wants_json
 
 EXIT_DIFFERENT = 1
 """The decisions of two compared runs differ."""
@@ -46,6 +47,25 @@ def print_error(error: HoldfastError, arguments: Sequence[str], component: str) 
     if isinstance(error, RunError) and error.command:
         fields["resume_command"] = error.command
     write_event(component, "error", **fields)
+
+
+@contextlib.contextmanager
+def goes_on(resuming: Options | None, command: str) -> Iterator[None]:
+    """Let an error of the user's code end what is resumed with the command that goes on.
+
+    That code may lack something outside, a licence or a port, that is there the next time.
+    """
+    try:
+        yield
+    except RunError:
+        raise
+    except HoldfastError as error:
+        from holdfast.config.user_code import is_of_user
+
+        if resuming is None or not is_of_user(error):
+            raise
+        again = shlex.join(["holdfast", command, *resuming.words("quiet")])
+        raise RunError(error, again, EXIT_CAN_GO_ON) from error
 
 
 class EndedBySignal(KeyboardInterrupt):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from holdfast.cli.exit_codes import ended_by_signals
+from holdfast.cli.run_figure import require_matplotlib
 from holdfast.cli.terminal import counted, progress_line
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import HoldfastError, OptionError, OutputError
@@ -33,18 +34,29 @@ if TYPE_CHECKING:
 _NOTE = "decided as recorded"
 """The note of the progress bar."""
 
-_RANGE = re.compile(r"(\d{1,9}):(\d{1,9})")
+_RANGE = re.compile(r"(\d{1,9})(?::(\d{1,9}))?")
+_PICTURES = (".pdf", ".png", ".svg")
 
 
 def trial_range(text: str) -> range:
-    """Read ``A:B``."""
+    """Read ``A:B``, or ``N`` for one trial."""
     match = _RANGE.fullmatch(text)
-    if match is None or int(match[2]) > MAX_TRIALS:
-        raise bad_value(text, f"two whole numbers A:B from 0 to {MAX_TRIALS}, such as 0:5")
-    begin, end = map(int, match.groups())
+    begin, end = (
+        (int(match[1]), int(match[2] or int(match[1]) + 1)) if match else (0, MAX_TRIALS + 1)
+    )
+    if end > MAX_TRIALS:
+        raise bad_value(text, f"one trial N, or A:B from 0 to {MAX_TRIALS}, such as 7 or 0:5")
     if begin >= end:
         raise bad_value(text, "A:B with B above A: 0:5 are the first five trials")
     return range(begin, end)
+
+
+def picture(text: str) -> Path:
+    """Read the path of a picture, whose name says its format."""
+    path = location(text)
+    if path.suffix.lower() not in _PICTURES:
+        raise bad_value(text, f"names that end with {', '.join(_PICTURES)}")
+    return path
 
 
 def trials_option() -> Any:
@@ -52,7 +64,7 @@ def trials_option() -> Any:
     return option(
         metavar="A:B",
         read=trial_range,
-        help="Only the trials from A up to, but without, B (default: all).",
+        help="Only the trials from A up to, but without, B, or the one trial N (default: all).",
     )
 
 
@@ -90,6 +102,12 @@ class ExportOptions(Options):
         read=location,
         help="Write DIR: trials.csv, steps.csv, beliefs.csv and events.csv.",
     )
+    figure: Path | None = option(
+        metavar="FILE",
+        read=picture,
+        help="Write FILE (.pdf, .png or .svg): trial.png's figure of another trial, the first of "
+        "--trials (extra figures).",
+    )
     trials: range | None = trials_option()
     problem_directory: Path | None = problem_directory_option()
     quiet: bool = flag("-q", help="Show no progress.")
@@ -98,8 +116,8 @@ class ExportOptions(Options):
 def main(arguments: Sequence[str]) -> int:
     """Write what the options ask for and return the exit code."""
     options = ExportOptions.parse("export", arguments)
-    if options.mcap is None and options.tables is None:
-        raise OptionError("nothing to write: give --mcap FILE or --csv DIR, or both")
+    if options.mcap is None and options.tables is None and options.figure is None:
+        raise OptionError("nothing to write: give --mcap FILE, --csv DIR or --figure FILE")
     with ended_by_signals():
         _export(options)
     return 0
@@ -116,12 +134,17 @@ def _export(options: ExportOptions) -> None:
         require_free(tables, "--csv", directory=True)
         if mcap == tables:
             raise OptionError(f"--mcap and --csv are both {shown_path(mcap)}; give two places")
+    if options.figure is not None:
+        require_matplotlib()
+        require_free(options.figure, "--figure", directory=False)
+        if mcap == options.figure or tables == options.figure:
+            raise OptionError(f"{shown_path(options.figure)} is given twice; give two places")
     from holdfast.reports.replay import RecordedRun
 
     with RecordedRun(path, problem_directory=options.problem_directory) as recorded:
         trials = chosen_trials(recorded, wanted)
         notes = _write(recorded, trials, options)
-    print_written([] if options.quiet else notes, mcap, tables)
+    print_written([] if options.quiet else notes, mcap, tables, options.figure)
 
 
 def chosen_trials(recorded: RecordedRun, wanted: range | None) -> list[int]:
@@ -134,8 +157,9 @@ def chosen_trials(recorded: RecordedRun, wanted: range | None) -> list[int]:
     else:
         assert wanted is not None
         first, last = recorded.trials[0], recorded.trials[-1]
+        asked = f"from {wanted.start} to {wanted.stop - 1}" if len(wanted) > 1 else wanted.start
         why = (
-            f"has no trial from {wanted.start} to {wanted.stop - 1} (--trials); it has "
+            f"has no trial {asked} (--trials); it has "
             f"{counted(len(recorded.trials), 'trial')} from {first} to {last}"
         )
     raise OutputError(f"{recorded.path}: {why}")
@@ -143,7 +167,9 @@ def chosen_trials(recorded: RecordedRun, wanted: range | None) -> list[int]:
 
 def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions) -> list[str]:
     """Write all of it beside its places, and move it there when all is whole; return notes."""
+    from holdfast.planning.planner import Planner
     from holdfast.reports.csv_export import CsvSink
+    from holdfast.reports.recorder import Recorder
 
     mcap, tables = options.mcap, options.tables
     notes = notes_about(recorded)
@@ -173,18 +199,22 @@ def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions)
                     files.enter_context(CsvSink(directory, recorded.configuration.problem))
                 )
                 made.append((directory, tables))
+            planner = Planner(recorded.configuration.problem, recorded.configuration.planning)
+            recorded.observer = first = Recorder(trials[0], planner)
             replay_trials(recorded, trials, sinks, quiet=options.quiet)
+        if options.figure is not None:
+            from holdfast.reports.figure import trial_figure
+
+            picture = stack.enter_context(directory_beside(options.figure)) / options.figure.name
+            trial_figure(recorded.configuration, first.record, picture)
+            made.append((picture, options.figure))
         for here, there in made:
             move_into_place(here, there)
     return notes
 
 
 def replay_trials(
-    recorded: RecordedRun,
-    trials: Sequence[int],
-    sinks: Sequence[FactSink],
-    *,
-    quiet: bool,
+    recorded: RecordedRun, trials: Sequence[int], sinks: Sequence[FactSink], *, quiet: bool
 ) -> None:
     """Write the facts of trials to sinks, and show the progress."""
     line = progress_line(len(trials), quiet=quiet)

@@ -6,6 +6,7 @@ values are an error. An option that was not given replaces nothing.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -13,7 +14,10 @@ from holdfast.errors import InvalidValueError
 
 
 class Override(NamedTuple):
-    """Plain data for a ``section.key`` instead of the file's, and its words on the command line."""
+    """Plain data for a ``section.key`` instead of the file's, and its words on the command line.
+
+    The key may go on below: ``model.holes.0.width`` changes nothing else of ``model.holes``.
+    """
 
     words: str
     key: str
@@ -28,27 +32,26 @@ class Override(NamedTuple):
 def parse_assignment(assignment: str) -> Override:
     """Read ``SECTION.KEY=VALUE``, as ``--set`` takes it; the value is YAML.
 
-    Raises InvalidValueError if it is not of that form, names a key below a key, or has no value;
-    ConfigurationError if the value is not YAML.
+    Raises InvalidValueError if it is not of that form, or has no value; ConfigurationError if the
+    value is not YAML.
     """
     from holdfast.config.yaml_document import read
 
     name, equals, text = assignment.partition("=")
-    section, dot, key = name.strip().partition(".")
-    if not (equals and dot and section and key):
+    key = re.sub(r"\[(\d+)\]", r".\1", name.strip())  # as messages name an item of a list
+    if not (equals and all(key.split(".")) and ("." in key or key == "problem_directory")):
+        from holdfast.config.source import SETTINGS
+
+        homes = [name for name, kind in SETTINGS.items() if key in kind.__struct_fields__]
+        hint = f"; did you mean {homes[0]}.{assignment}?" if homes else ""
+        hint = "; that is --problem" if key == "problem" else hint
         raise InvalidValueError(
-            f"--set {assignment}: must be SECTION.KEY=VALUE, such as selector.method=random"
-        )
-    inner, below, rest = key.partition(".")
-    if below:
-        raise InvalidValueError(
-            f"--set {assignment}: only whole keys of a section can be set; write --set "
-            f"'{section}.{inner}={{{rest}: {text}}}'"
+            f"--set {assignment}: must be SECTION.KEY=VALUE, such as selector.method=random{hint}"
         )
     value = read(text.encode(), f"--set {name}").data
     if value is None and text.strip() not in ("null", "~"):
         raise InvalidValueError(f"--set {assignment}: has no value")
-    return Override(f"--set {assignment}", f"{section}.{key}", value)
+    return Override(f"--set {assignment}", key, value)
 
 
 def parse_values(assignment: str) -> Override:
@@ -65,11 +68,14 @@ def combined(overrides: Iterable[Override]) -> dict[str, Any]:
     """Return the values by key; raise InvalidValueError if two of them contradict each other."""
     by_key: dict[str, Override] = {}
     for override in overrides:
-        other = by_key.setdefault(override.key, override)
-        # As text, because 1 and true are equal but not the same.
-        if repr(other.value) != repr(override.value):
-            raise InvalidValueError(
-                f"{other.words} and {override.words} contradict each other: both say what "
-                f"{override.key} is; leave one of them out"
-            )
+        for other in by_key.values():
+            outer, inner = sorted((other.key, override.key), key=len)
+            # As text, because 1 and true are equal but not the same.
+            differ = outer != inner or repr(other.value) != repr(override.value)
+            if differ and f"{inner}.".startswith(f"{outer}."):
+                raise InvalidValueError(
+                    f"{other.words} and {override.words} contradict each other: both say what "
+                    f"{inner} is; leave one of them out"
+                )
+        by_key.setdefault(override.key, override)
     return {key: override.value for key, override in by_key.items()}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from holdfast.cli.exit_codes import ended_by_signals
 from holdfast.cli.export import print_written, problem_directory_option, user_errors_told
-from holdfast.cli.terminal import counted, progress_line
+from holdfast.cli.terminal import progress_line
 from holdfast.runtime.command_line import Options, argument, flag, location, option, whole_number
 from holdfast.runtime.files import require_free, shown_path, write_atomically
 
@@ -36,7 +36,10 @@ class ReportOptions(Options):
         least=1,
     )
     out: Path | None = option(
-        "-o", metavar="FILE", read=location, help="The file (default: RUN-report.html)."
+        "-o",
+        metavar="FILE",
+        read=location,
+        help="The file (default: RUN-report.html); an earlier report there is replaced.",
     )
     worst: int = option(
         metavar="N",
@@ -51,15 +54,16 @@ class ReportOptions(Options):
 def main(arguments: Sequence[str]) -> int:
     """Write the report and return the exit code."""
     options = ReportOptions.parse("report", arguments)
-    from holdfast.reports.html_page import require_vega
+    from holdfast.reports.html_page import GENERATOR, require_vega
 
     require_vega()
     first = options.runs[0].absolute()
     name = first.parent.name if first.is_file() else first.name
     out = options.out or Path(f"{name}-report.html")
-    require_free(out, "--out", directory=False)
+    require_free(out, "--out", directory=False, ours=GENERATOR)
     with ended_by_signals():
         content, notes = _page(options)
+        require_free(out, "--out", directory=False, ours=GENERATOR)  # it may have come meanwhile
         write_atomically(out, content)
     print_written([] if options.quiet else notes, out)
     return 0
@@ -74,7 +78,7 @@ def _page(options: ReportOptions) -> tuple[bytes, list[str]]:
     if not is_run(options.runs[0]):
         return results_page(options.runs[0])
     line = progress_line(options.worst, quiet=options.quiet)
-    line.start(f"{counted(options.worst, 'trial')} of {runs[0]}", 0, "computed again")
+    line.start(f"report of {runs[0]}", 0, "computed again")
     try:
         with user_errors_told("the problem of the run"):
             return run_page(

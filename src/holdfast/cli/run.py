@@ -9,15 +9,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from holdfast.cli.exit_codes import (
-    EXIT_CAN_GO_ON,
-    EXIT_ERROR,
-    EXIT_REBOOTED,
-    EXIT_WRONG_ANSWER,
-    ended_by_signals,
-    interrupted_by,
-    say_interrupted,
-)
+from holdfast.cli import exit_codes
 from holdfast.cli.run_figure import Remark, draw_figure
 from holdfast.cli.run_options import RunOptions
 from holdfast.cli.terminal import (
@@ -66,7 +58,8 @@ def main(arguments: Sequence[str]) -> int:
 
         options.watchdog_s = options.watchdog_s or DEFAULT_WATCHDOG_S
         return run_until_it_ends(["run", *options.words("restart")])
-    with ended_by_signals():
+    goes_on = options.resume or options.resume_if_begun
+    with exit_codes.ended_by_signals(), exit_codes.goes_on(options if goes_on else None, "run"):
         return _run(options)
 
 
@@ -179,7 +172,7 @@ def _run(options: RunOptions) -> int:
                 remark = draw_figure(configuration, directory, recorder)
         except KeyboardInterrupt as interruption:
             notes.ended_early(
-                interrupted_by(interruption),
+                exit_codes.interrupted_by(interruption),
                 f"{len(directory.journal.finished())} of {configuration.simulator.num_trials} "
                 f"trials are finished and kept in {shown_path(directory_path)}",
                 options.resume_command(directory_path),
@@ -195,7 +188,7 @@ def _run(options: RunOptions) -> int:
 
             if isinstance(error, RebootedError):
                 command = f"{options.resume_command(directory_path)} --after-reboot"
-                raise RunError(error, command, EXIT_REBOOTED) from error
+                raise RunError(error, command, exit_codes.EXIT_REBOOTED) from error
             cannot_go_on = (
                 isinstance(error, UnknownPerformanceError | LostJournalError)
                 or directory.journal.is_empty()
@@ -203,7 +196,9 @@ def _run(options: RunOptions) -> int:
             resume = None if cannot_go_on else options.resume_command(directory_path)
             # Of two processes of one run each would end the other, were both started again.
             again = resume is not None and not isinstance(error, StaleEpochError)
-            exit_code = _exit_code(summary) or (EXIT_CAN_GO_ON if again else EXIT_ERROR)
+            exit_code = _exit_code(summary) or (
+                exit_codes.EXIT_CAN_GO_ON if again else exit_codes.EXIT_ERROR
+            )
             raise RunError(error, resume, exit_code) from error
         if not quiet:
             print_files(directory_path)
@@ -334,7 +329,7 @@ def _out_of_one_run(options: RunOptions) -> Path:
 def _exit_code(summary: RunSummary | None) -> int:
     """Return the exit code of a run that came to its end."""
     if summary is not None and (summary.wrong_answers or summary.not_deterministic):
-        return EXIT_WRONG_ANSWER
+        return exit_codes.EXIT_WRONG_ANSWER
     return 0
 
 
@@ -386,7 +381,11 @@ def _require_effect(options: RunOptions, configuration: Configuration, *, as_rob
                 f"{given.words} needs --service (or offload.services in "
                 f"{shown_path(options.configuration)}): without a service it would do nothing"
             )
-        if given.key in _OF_ENVIRONMENTS and given.value and not configuration.environment.object:
+        if (
+            given.key.startswith(_OF_ENVIRONMENTS)
+            and given.value
+            and not configuration.environment.object
+        ):
             raise InvalidValueError(
                 f"{given.words} needs --environment (or environment.object in "
                 f"{shown_path(options.configuration)}): without an environment it would do nothing"
@@ -439,7 +438,7 @@ class _Notes:
         if self._as_json:
             self._event("interrupted", reason=f"{how}. {kept}", resume_command=command)
         else:
-            say_interrupted(how, kept, command)
+            exit_codes.say_interrupted(how, kept, command)
 
     @contextlib.contextmanager
     def while_it_lasts(self, text: str) -> Iterator[None]:

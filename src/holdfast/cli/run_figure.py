@@ -18,7 +18,7 @@ import msgspec
 
 from holdfast.cli.exit_codes import EXIT_WRONG_ANSWER
 from holdfast.cli.terminal import duration
-from holdfast.errors import DecidedOtherwiseError, how_to_install
+from holdfast.errors import DecidedOtherwiseError, HoldfastError, how_to_install
 
 if TYPE_CHECKING:
     from holdfast.config.loader import Configuration
@@ -74,13 +74,11 @@ def _drawn(
                 f"with {duration(again_s)} of sensing decisions"
             )
     try:
-        with own_backend():
-            from holdfast.reports.figure import trial_figure
-    except ImportError as error:
-        if error.name is None or error.name.split(".")[0] != "matplotlib":
-            raise
-        advice = how_to_install("matplotlib")
-        return Remark(f"no figure, because matplotlib is not installed: {advice}")
+        require_matplotlib()
+    except HoldfastError as error:
+        return Remark(f"no figure, because {error}")
+    from holdfast.reports.figure import trial_figure
+
     if recorder.record.result is None:
         kept = msgspec.structs.replace(result, decisions=directory.journal.decisions(trial))
         try:
@@ -94,6 +92,18 @@ def _drawn(
         recorder.record.result = result  # it alone has the reward of the last step
     trial_figure(configuration, recorder.record, path)
     return None
+
+
+def require_matplotlib() -> None:
+    """Import what draws figures; raise HoldfastError if matplotlib is not installed."""
+    try:
+        with own_backend():
+            import holdfast.reports.figure  # noqa: F401
+    except ImportError as error:
+        if error.name is None or error.name.split(".")[0] != "matplotlib":
+            raise
+        advice = how_to_install("matplotlib")
+        raise HoldfastError(f"matplotlib is not installed: {advice}") from error
 
 
 @contextlib.contextmanager

@@ -9,19 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 from holdfast.cli.overrides import Override, combined, parse_assignment
 from holdfast.errors import InvalidValueError
 from holdfast.reports.view_target import ViewTarget, viewer_url
-from holdfast.runtime.command_line import (
-    MAX_TRIALS,
-    Options,
-    argument,
-    bad_value,
-    flag,
-    jobs_option,
-    location,
-    number,
-    option,
-    seed_option,
-    whole_number,
-)
+from holdfast.runtime import command_line
 from holdfast.runtime.files import shown_path
 from holdfast.runtime.log_lines import LogFormat
 from holdfast.runtime.logs import log_option
@@ -45,10 +33,10 @@ def viewer(text: str) -> str:
             if equals:
                 viewer_url(place)
             return text
-    raise bad_value(text, "rerun, or rerun=HOST:PORT of a viewer that runs elsewhere")
+    raise command_line.bad_value(text, "rerun, or rerun=HOST:PORT of a viewer that runs elsewhere")
 
 
-class RunOptions(Options):
+class RunOptions(command_line.Options):
     """Run the trials of CONFIG and write their results into a directory.
 
     DIR gets trials.csv (a row for each trial), summary.json, config.yaml (with all defaults filled
@@ -65,53 +53,42 @@ class RunOptions(Options):
     exit_codes: ClassVar = {3: None, 4: None, 5: None}
     needs_arguments = True
 
-    configuration: Path = argument("CONFIG", "Configuration file (YAML) of the run.", location)
-    trials: int | None = option(
+    configuration: Path = command_line.argument(
+        "CONFIG", "Configuration file (YAML) of the run.", command_line.location
+    )
+    trials: int | None = command_line.option(
         metavar="N",
-        read=whole_number(1, MAX_TRIALS),
+        read=command_line.whole_number(1, command_line.MAX_TRIALS),
         key="simulator.num_trials",
         help="Number of trials, instead of the file's.",
     )
-    seed: int | None = seed_option()
-    problem: str | None = option(
-        metavar="NAME",
-        help="Problem to run, instead of the file's: a registered name or module:Class.",
-    )
-    assignments: tuple[str, ...] = option(
-        "--set",
-        metavar="SECTION.KEY=VALUE",
-        many=True,
-        help="A value instead of the file's, as YAML: selector.method=random.",
-    )
-    jobs: int | None = jobs_option()
-    out: Path | None = option(
-        "-o",
-        metavar="DIR",
-        read=location,
-        help="Directory for the results (default: runs/CONFIG-seedS, numbered if taken).",
-    )
-    resume: bool = flag(
+    seed: int | None = command_line.seed_option()
+    problem: str | None = command_line.problem_option()
+    problem_directory: Path | None = command_line.module_option()
+    assignments: tuple[str, ...] = command_line.set_option("selector.method=random")
+    jobs: int | None = command_line.jobs_option()
+    out: Path | None = command_line.out_option("CONFIG-seedS")
+    resume: bool = command_line.flag(
         help="Go on with the run in DIR (default: the latest) and run the missing trials; with a "
-        "larger --trials, more than it had.",
+        "larger --trials, more than it had."
     )
-    resume_if_begun: bool = flag(
+    resume_if_begun: bool = command_line.flag(
         help="Go on with the run in DIR if it has begun, otherwise begin it; needs --out. For a "
-        "unit or container that repeats one command.",
+        "unit or container that repeats one command."
     )
-    after_reboot: bool = flag(
+    after_reboot: bool = command_line.flag(
         help="Let the robot go on although the machine was rebooted since it last moved; without "
-        "this, a run that is resumed then ends with code 5.",
+        "this, a run that is resumed then ends with code 5."
     )
-    restart: bool = flag(
+    restart: bool = command_line.flag(
         help="Start the run again when its process dies or fails, but not after the codes 0, 3 and "
         "5 and a signal that ends it in order; needs --resume-if-begun. For a container, which the "
-        "engine must not restart.",
+        "engine must not restart."
     )
-    quiet: bool = flag(
-        "-q",
-        help="Show no progress and no summary: only errors. The files are the same.",
+    quiet: bool = command_line.flag(
+        "-q", help="Show no progress and no summary: only errors. The files are the same."
     )
-    service: tuple[str, ...] = option(
+    service: tuple[str, ...] = command_line.option(
         "-s",
         metavar="ENDPOINT",
         many=True,
@@ -119,49 +96,49 @@ class RunOptions(Options):
         help="Let the service at ENDPOINT decide (tcp/10.0.0.7:7447); several are tried in this "
         "order.",
     )
-    recovery: str | None = option(
+    recovery: str | None = command_line.option(
         metavar="WHEN",
         key="recovery.launch",
         help="When to launch the local service: on_failure (the default), at_start or never.",
     )
-    tls: Path | None = option(
+    tls: Path | None = command_line.option(
         metavar="DIR",
-        read=location,
+        read=command_line.location,
         key="offload.tls",
         help="This robot's credentials, as holdfast keys makes them.",
     )
-    environment: str | None = option(
+    environment: str | None = command_line.option(
         "-e",
         metavar="MODULE:CLASS",
         key="environment.object",
         help="Act on this environment instead of a simulated one.",
     )
-    rate: float | None = option(
+    rate: float | None = command_line.option(
         metavar="HZ",
-        read=number(_MIN_RATE_HZ, _MAX_RATE_HZ, "Hz"),
+        read=command_line.number(_MIN_RATE_HZ, _MAX_RATE_HZ, "Hz"),
         help="Task actions a second (default: as fast as possible).",
     )
-    health: HttpAddress | None = option(
+    health: HttpAddress | None = command_line.option(
         metavar="HOST:PORT",
         read=http_address,
         help="Answer http://HOST:PORT/livez, and /readyz while a service or the robot itself "
         "decides; a PORT alone is one of 127.0.0.1.",
     )
-    metrics: HttpAddress | None = option(
+    metrics: HttpAddress | None = command_line.option(
         metavar="HOST:PORT",
         read=http_address,
         help="Offer this robot's metrics for Prometheus at http://HOST:PORT/metrics. The address "
         "may be that of --health.",
     )
-    view: str | None = option(
+    view: str | None = command_line.option(
         metavar="rerun",
         read=viewer,
         help="Show the run in Rerun's viewer while it goes on (extra view); rerun=HOST:PORT is one "
         "that runs elsewhere.",
     )
-    view_file: Path | None = option(
+    view_file: Path | None = command_line.option(
         metavar="FILE",
-        read=location,
+        read=command_line.location,
         help="Write what is shown to FILE (.rrd), with --view or without it.",
     )
     log: LogFormat = log_option("Format of the events shown: text or json.")

@@ -7,11 +7,12 @@ import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from holdfast.cli.exit_codes import (
     EXIT_CAN_GO_ON,
     ended_by_signals,
+    goes_on,
     interrupted_by,
     say_interrupted,
 )
@@ -19,17 +20,7 @@ from holdfast.cli.overrides import combined, parse_assignment, parse_values
 from holdfast.cli.terminal import counted, progress_line
 from holdfast.errors import HoldfastError, InvalidValueError, RunError
 from holdfast.printable import printable
-from holdfast.runtime.command_line import (
-    MAX_TRIALS,
-    Options,
-    argument,
-    flag,
-    jobs_option,
-    location,
-    option,
-    seed_option,
-    whole_number,
-)
+from holdfast.runtime import command_line
 from holdfast.runtime.files import shown_path
 from holdfast.runtime.output_directory import claim_directory
 
@@ -41,7 +32,7 @@ if TYPE_CHECKING:
 _RUNS = Path("runs")
 
 
-class SweepOptions(Options):
+class SweepOptions(command_line.Options):
     """Run all combinations of values on the same worlds, and compare them.
 
     Each --set names the values of a key; a key with one value is set in all combinations. Each
@@ -55,37 +46,35 @@ class SweepOptions(Options):
     exit_codes: ClassVar = {4: None}
     needs_arguments = True
 
-    configuration: Path = argument("CONFIG", "Configuration file (YAML) of the runs.", location)
-    assignments: tuple[str, ...] = option(
+    configuration: Path = command_line.argument(
+        "CONFIG", "Configuration file (YAML) of the runs.", command_line.location
+    )
+    assignments: tuple[str, ...] = command_line.option(
         "--set",
         metavar="SECTION.KEY=A,B,...",
         many=True,
         help="Values of a key, as YAML: selector.method=path_entropy,random. May be given for "
         "several keys; the last varies fastest.",
     )
-    baseline: tuple[str, ...] = option(
+    baseline: tuple[str, ...] = command_line.option(
         metavar="SECTION.KEY=A",
         many=True,
         help="Compare with the first combination that has this value (default: the first of all).",
     )
-    trials: int | None = option(
+    problem_directory: Path | None = command_line.module_option()
+    trials: int | None = command_line.option(
         metavar="N",
-        read=whole_number(2, MAX_TRIALS),
+        read=command_line.whole_number(2, command_line.MAX_TRIALS),
         key="simulator.num_trials",
         help="Number of trials of each combination, instead of the file's.",
     )
-    seed: int | None = seed_option()
-    jobs: int | None = jobs_option()
-    out: Path | None = option(
-        "-o",
-        metavar="DIR",
-        read=location,
-        help="Directory for the results (default: runs/sweep-CONFIG, numbered if taken).",
-    )
-    resume: bool = flag(
+    seed: int | None = command_line.seed_option()
+    jobs: int | None = command_line.jobs_option()
+    out: Path | None = command_line.out_option("sweep-CONFIG")
+    resume: bool = command_line.flag(
         help="Go on with the sweep in DIR, perhaps with more values or trials; needs --out."
     )
-    quiet: bool = flag("-q", help="Show no progress: only the table and errors.")
+    quiet: bool = command_line.flag("-q", help="Show no progress: only the table and errors.")
 
     def arms(self) -> list[SweptArm]:
         """Return the combinations."""
@@ -93,11 +82,13 @@ class SweepOptions(Options):
         from holdfast.tuning.sweep import arms_of
 
         axes = combined(map(parse_values, self.assignments))
-        own = {"simulator.num_trials": self.trials, "simulator.seed": self.seed}
-        given = {key: value for key, value in own.items() if value is not None}
-        for key in given.keys() & axes.keys():
-            option_name = "--trials" if key.endswith("trials") else "--seed"
-            raise InvalidValueError(f"{option_name} and --set both say what {key} is")
+        given: dict[str, Any] = {}
+        for name in ("trials", "seed", "problem_directory"):
+            own, value = self.table()[name], getattr(self, name)
+            if value is not None and own.key in axes:
+                raise InvalidValueError(f"{own.names[0]} and --set both say what {own.key} is")
+            if value is not None:
+                given[str(own.key)] = str(value) if isinstance(value, Path) else value
 
         path = shown_path(self.configuration)
         return arms_of(axes, lambda values: load(path, overrides={**given, **values}))
@@ -115,7 +106,8 @@ def main(arguments: Sequence[str]) -> int:
     from holdfast.tuning.sweep import Sweep
 
     runs = _RUNS.absolute()  # before the user's code, which may change the current directory
-    arms = options.arms()
+    with goes_on(options if options.resume else None, "sweep"):
+        arms = options.arms()
     baseline = _baseline_of(options, arms)
     if len(arms) == 1:
         raise InvalidValueError(

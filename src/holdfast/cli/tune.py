@@ -13,6 +13,7 @@ from typing import ClassVar
 from holdfast.cli.exit_codes import (
     EXIT_CAN_GO_ON,
     ended_by_signals,
+    goes_on,
     interrupted_by,
     say_interrupted,
 )
@@ -20,19 +21,7 @@ from holdfast.cli.overrides import combined, parse_assignment
 from holdfast.cli.terminal import duration, progress_line
 from holdfast.errors import InvalidValueError, OutputError, RunError, WorkerDiedError
 from holdfast.printable import printable
-from holdfast.runtime.command_line import (
-    Options,
-    argument,
-    bad_value,
-    flag,
-    jobs_option,
-    location,
-    number,
-    one_of,
-    option,
-    seed_option,
-    whole_number,
-)
+from holdfast.runtime import command_line
 from holdfast.runtime.files import shown_path
 from holdfast.runtime.output_directory import claim_directory
 
@@ -51,7 +40,7 @@ def _seconds(text: str) -> float:
     found = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
     value = float(found[1]) * _UNITS_S[found[2]] if found else 0.0
     if not 1.0 <= value <= _LONGEST_S:
-        raise bad_value(text, "durations from 1s to 720h, such as 90s, 10m or 2h")
+        raise command_line.bad_value(text, "durations from 1s to 720h, such as 90s, 10m or 2h")
     return value
 
 
@@ -61,11 +50,11 @@ def variations(text: str) -> str:
 
     for each in text.split(","):
         if each not in VARIATIONS:
-            raise bad_value(text, f"lists of {', '.join(VARIATIONS)}, with commas")
+            raise command_line.bad_value(text, f"lists of {', '.join(VARIATIONS)}, with commas")
     return text
 
 
-class TuneOptions(Options):
+class TuneOptions(command_line.Options):
     """Find what to sense on the problem of CONFIG, by simulating it.
 
     Methods and settings race in the same simulated worlds; what is beaten is dropped. The winner is
@@ -78,8 +67,10 @@ class TuneOptions(Options):
     needs_arguments = True
     exit_codes: ClassVar = {4: None}
 
-    configuration: Path = argument("CONFIG", "Configuration file (YAML).", location)
-    vary: str = option(
+    configuration: Path = command_line.argument(
+        "CONFIG", "Configuration file (YAML).", command_line.location
+    )
+    vary: str = command_line.option(
         metavar="WHAT,...",
         read=variations,
         default="methods,looks,resolution",
@@ -87,57 +78,48 @@ class TuneOptions(Options):
         "times), estimators, fixed (always one sensing action); then, of the winner, interval "
         "and particles.",
     )
-    objective: str | None = option(
+    objective: str | None = command_line.option(
         metavar="NAME",
-        read=one_of("reward", "steps", "success"),
+        read=command_line.one_of("reward", "steps", "success"),
         help="What decides: reward (less prices), steps (without success the limit) or success "
         "(default: reward if sensing has prices, else steps).",
     )
-    budget: str = option(
+    budget: str = command_line.option(
         metavar="TIME",
         read=duration_text,
         default="10m",
         help="How long it may take, but for the trials that run at its end: 90s, 10m, 2h.",
     )
-    trials: int = option(
+    trials: int = command_line.option(
         metavar="N",
-        read=whole_number(20, _MOST_TRIALS),
+        read=command_line.whole_number(20, _MOST_TRIALS),
         default=200,
         help="Most trials of a candidate in the race, and as many to judge.",
     )
-    max_decision_ms: float = option(
+    max_decision_ms: float = command_line.option(
         metavar="MS",
-        read=number(1e-3, 3.6e6, "ms"),
+        read=command_line.number(1e-3, 3.6e6, "ms"),
         default=math.inf,
         help="No candidate may win whose median decision takes longer (default: no limit).",
     )
-    jobs: int | None = jobs_option(more="")
-    ray: str | None = option(
+    jobs: int | None = command_line.jobs_option(more="")
+    ray: str | None = command_line.option(
         metavar="ADDRESS",
         help="Run the trials on a Ray cluster: auto (of this machine), HOST:PORT or "
         "ray://HOST:PORT; on all of its cores unless --jobs says otherwise.",
     )
-    seed: int | None = seed_option()
-    assignments: tuple[str, ...] = option(
-        "--set",
-        metavar="SECTION.KEY=VALUE",
-        many=True,
-        help="A value instead of the file's, as YAML: simulator.max_steps=200.",
+    seed: int | None = command_line.seed_option()
+    assignments: tuple[str, ...] = command_line.set_option("simulator.max_steps=200")
+    problem: str | None = command_line.problem_option()
+    problem_directory: Path | None = command_line.module_option()
+    out: Path | None = command_line.out_option("CONFIG-tuned")
+    resume: bool = command_line.flag(
+        help="Go on with the tuning in DIR; a larger --budget finds more."
     )
-    problem: str | None = option(
-        metavar="NAME", help="Problem instead of the file's: a registered name or module:Class."
-    )
-    out: Path | None = option(
-        "-o",
-        metavar="DIR",
-        read=location,
-        help="Directory for the results (default: runs/CONFIG-tuned, numbered if taken).",
-    )
-    resume: bool = flag(help="Go on with the tuning in DIR; a larger --budget finds more.")
-    check: bool = flag(
+    check: bool = command_line.flag(
         default=True, help="Check the problem first, and stop at an error (holdfast check)."
     )
-    quiet: bool = flag("-q", help="Show only the sentence.")
+    quiet: bool = command_line.flag("-q", help="Show only the sentence.")
 
 
 @ended_by_signals()
@@ -157,8 +139,11 @@ def main(arguments: Sequence[str]) -> int:
 
     runs, began_s, budget_s = Path("runs").absolute(), monotonic(), _seconds(options.budget)
     given = combined(map(parse_assignment, options.assignments))
+    if options.problem_directory is not None:
+        given["problem_directory"] = str(options.problem_directory)
     path = shown_path(options.configuration)
-    configuration = load(path, problem=options.problem, seed=options.seed, overrides=given)
+    with goes_on(options if options.resume else None, "tune"):
+        configuration = load(path, problem=options.problem, seed=options.seed, overrides=given)
     if options.check and not options.resume:
         require_right(configuration, budget_s, warn)
     if options.resume:

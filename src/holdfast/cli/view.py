@@ -6,24 +6,12 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
+from holdfast.cli import export
 from holdfast.cli.exit_codes import ended_by_signals
-from holdfast.cli.export import (
-    chosen_trials,
-    notes_about,
-    print_written,
-    problem_directory_option,
-    replay_trials,
-    trials_option,
-)
 from holdfast.errors import InvalidValueError, OptionError
+from holdfast.printable import brief
 from holdfast.reports.view_target import ViewTarget, require_rerun, viewer_url
-from holdfast.runtime.command_line import (
-    Options,
-    argument,
-    flag,
-    location,
-    option,
-)
+from holdfast.runtime.command_line import Options, argument, flag, location, option
 from holdfast.runtime.files import directory_beside, move_into_place, require_free
 
 
@@ -40,15 +28,14 @@ class ViewOptions(Options):
     needs_arguments = True
 
     run: Path = argument("RUN", "Directory of a run, or its journal.", location)
-    trials: range | None = trials_option()
+    trials: range | None = export.trials_option()
     save: Path | None = option(
         metavar="FILE", read=location, help="Write FILE (.rrd) instead of showing it."
     )
     viewer: str | None = option(
-        metavar="HOST:PORT",
-        help="Show it in the viewer that listens there; Rerun's port is 9876.",
+        metavar="HOST:PORT", help="Show it in the viewer that listens there; Rerun's port is 9876."
     )
-    problem_directory: Path | None = problem_directory_option()
+    problem_directory: Path | None = export.problem_directory_option()
     quiet: bool = flag("-q", help="Show no progress.")
 
 
@@ -67,7 +54,9 @@ def _view(options: ViewOptions) -> None:
         try:
             url = viewer_url(options.viewer)
         except InvalidValueError as error:
-            raise OptionError(f"--viewer is {options.viewer!r:.80}; allowed are {error}") from error
+            raise OptionError(
+                f"--viewer is {brief(options.viewer)}; allowed are {error}"
+            ) from error
     require_rerun(ViewTarget(url))
     if save is not None:
         require_free(save, "--save", directory=False)
@@ -76,8 +65,8 @@ def _view(options: ViewOptions) -> None:
 
     own = options.problem_directory
     with RecordedRun(options.run, "view", problem_directory=own) as recorded, ExitStack() as stack:
-        trials = chosen_trials(recorded, options.trials)
-        notes = notes_about(recorded)
+        trials = export.chosen_trials(recorded, options.trials)
+        notes = export.notes_about(recorded)
         made = None
         if save is not None:
             made = stack.enter_context(directory_beside(save)) / save.name
@@ -85,7 +74,7 @@ def _view(options: ViewOptions) -> None:
         with RerunSink(
             recorded.configuration, target, has_times=recorded.has_times, live=False
         ) as sink:
-            replay_trials(recorded, trials, [sink], quiet=options.quiet)
+            export.replay_trials(recorded, trials, [sink], quiet=options.quiet)
         if save is not None and made is not None:
             move_into_place(made, save)
-    print_written([] if options.quiet else notes, save)
+    export.print_written([] if options.quiet else notes, save)

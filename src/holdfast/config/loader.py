@@ -41,6 +41,7 @@ from holdfast.planning.settings import (
     SimulatorSettings,
     unfit_for_the_method,
 )
+from holdfast.printable import did_you_mean
 from holdfast.problems.attributes import resolution_of, sensing_labels
 from holdfast.problems.problem import Problem
 from holdfast.validation import shown
@@ -180,20 +181,23 @@ def load(
 def _content(path: Path) -> bytes:
     """Return the content of the file, at most one byte over the limit."""
     try:
-        return read_bounded(path, MAX_BYTES + 1)
+        if path.suffix != ".py":
+            return read_bounded(path, MAX_BYTES + 1)
+        problem, what = f"{path.stem}:CLASS", "is Python"
     except FileNotFoundError:
-        hint = ""
-        if str(path) in names():
-            hint = (
-                f"; {path} is a problem, and a run needs a configuration file: one with the line "
-                f"'problem: {path}' is enough"
-            )
-        raise ConfigurationError(f"{path}: there is no such file{hint}") from None
+        problem, what = str(path), "there is no such file"
+        if problem not in names() and ":" not in problem:
+            beside = [str(each) for each in path.parent.glob("*.y*ml")]
+            raise ConfigurationError(f"{path}: {what}{did_you_mean(problem, beside)}") from None
     except IsADirectoryError:
         raise ConfigurationError(f"{path}: is a directory, not a configuration file") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise ConfigurationError(f"{path}: cannot be read: {reason}") from None
+    raise ConfigurationError(
+        f"{path}: {what}; {problem} is a problem, and a run needs a configuration file: one with "
+        f"the line 'problem: {problem}' is enough"
+    )
 
 
 def _build(

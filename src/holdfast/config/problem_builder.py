@@ -96,10 +96,7 @@ def _infer_problem(source: Source) -> str:
 
 
 def build_problem(
-    name: str,
-    problem_class: type,
-    model: Mapping[str, Any],
-    state_space_planner: Mapping[str, Any],
+    name: str, problem_class: type, model: Mapping[str, Any], state_space_planner: Mapping[str, Any]
 ) -> Problem:
     """Build a problem from plain data that did not come from a file.
 

@@ -17,6 +17,7 @@ import msgspec
 from holdfast.errors import InvalidValueError, UnknownProblemError
 from holdfast.numerics.arrays import plain
 from holdfast.numerics.floating_mode import in_own_mode
+from holdfast.printable import brief
 from holdfast.problems.problem import Problem
 
 GROUP = "holdfast.problems"
@@ -73,7 +74,7 @@ def make_problem(name: str, **settings: Any) -> Problem:
     """
     if not isinstance(name, str):
         raise InvalidValueError(
-            f"name is {name!r:.80}; expected a text: one of {', '.join(names())}, or module:Class"
+            f"name is {brief(name)}; expected a text: one of {', '.join(names())}, or module:Class"
         )
     kind = problem_class(name)
     planner_keys = getattr(getattr(kind, "StateSpacePlanner", None), "__struct_fields__", ())

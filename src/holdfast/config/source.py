@@ -16,49 +16,23 @@ import msgspec
 
 from holdfast.config.yaml_document import Document
 from holdfast.errors import ConfigurationError
-from holdfast.planning.settings import (
-    ActiveSensingSettings,
-    EnvironmentSettings,
-    LostSettings,
-    OffloadSettings,
-    ParticleFilterSettings,
-    RecoverySettings,
-    SelectorSettings,
-    SimulatorSettings,
-)
-from holdfast.validation import (
-    KeyPath,
-    close_match,
-    dotted,
-    field_names,
-    find_mismatch,
-    shown,
-)
+from holdfast.planning import settings
+from holdfast.validation import KeyPath, close_match, dotted, field_names, find_mismatch, shown
 
 SETTINGS: Mapping[str, type[msgspec.Struct]] = {
-    "particle_filter": ParticleFilterSettings,
-    "active_sensing": ActiveSensingSettings,
-    "simulator": SimulatorSettings,
-    "selector": SelectorSettings,
-    "offload": OffloadSettings,
-    "recovery": RecoverySettings,
-    "lost": LostSettings,
-    "environment": EnvironmentSettings,
+    "particle_filter": settings.ParticleFilterSettings,
+    "active_sensing": settings.ActiveSensingSettings,
+    "simulator": settings.SimulatorSettings,
+    "selector": settings.SelectorSettings,
+    "offload": settings.OffloadSettings,
+    "recovery": settings.RecoverySettings,
+    "lost": settings.LostSettings,
+    "environment": settings.EnvironmentSettings,
 }
 """The sections whose keys do not depend on the problem, and their types."""
 
-SECTIONS = (
-    "model",
-    "particle_filter",
-    "state_space_planner",
-    "active_sensing",
-    "simulator",
-    "selector",
-    "offload",
-    "recovery",
-    "lost",
-    "environment",
-)
+_FIRST, *_OTHERS = SETTINGS
+SECTIONS = ("model", _FIRST, "state_space_planner", *_OTHERS)
 """In the order in which a resolved configuration lists them."""
 
 _MOVED = {"holdfast.lab.studies.": "studies.", "holdfast.lab.": "holdfast_lab."}
@@ -120,14 +94,22 @@ class Source:
                 raise self.error((name,), f"is {shown(section)}; expected a mapping of keys")
             self.sections[name] = dict(section or {})
         for given, value in overrides.items():
-            name, _, key = given.partition(".")
-            key = _RENAMED.get((name, key), key)
-            if name not in SECTIONS:
-                raise self.unknown((name,), SECTIONS)
-            self.sections[name][key] = (
-                name_of_today(value) if given == "environment.object" else value
-            )
-            self._overrides.add((name, key))
+            self._overrides.add(self._override(given, value))
+
+    def _override(self, given: str, value: Any) -> KeyPath:
+        """Let a value stand at a key, whatever the file says there, and return its path."""
+        name, _, key = given.partition(".")
+        if given == "problem_directory":
+            self.problem_directory = value
+            return (given,)
+        if name not in SECTIONS:
+            raise self.unknown((name,), SECTIONS)
+        inner, _, below = key.partition(".")
+        if below and name in SETTINGS and inner not in field_names(SETTINGS[name]):
+            self._overrides.add((name, inner))
+            raise self.unknown((name, inner), field_names(SETTINGS[name]))
+        own = name_of_today(value) if given == "environment.object" else value
+        return put_at(self.sections, f"{name}.{_RENAMED.get((name, key), key)}", own)
 
     def place(self, path: KeyPath) -> str:
         """Return the file, and the line of the value at ``path`` where there is one."""
@@ -136,7 +118,7 @@ class Source:
 
     def is_overridden(self, path: KeyPath) -> bool:
         """Return whether the value at ``path`` replaces the file's."""
-        return path[:2] in self._overrides
+        return any(path[: len(each)] == each for each in self._overrides)
 
     def directory_of(self, path: KeyPath) -> Path:
         """Return the directory to which a relative path that stands at ``path`` is relative."""
@@ -185,10 +167,40 @@ class Source:
                 f"is not a known {what}{close_match(key, allowed) or close_match(key, elsewhere)}"
             )
         text = f"{hint}\nallowed: {', '.join(allowed) or 'no keys'}"
-        if len(path) == 2 and self.is_overridden(path):
+        if path in self._overrides:
             # The key itself was given instead of the file's, which has nothing to do with it.
             return ConfigurationError(f"{dotted(path)} {text}")
         return self.error(path, text)
+
+
+def put_at(data: dict[str, Any], key: str, value: Any) -> KeyPath:
+    """Set the value of ``section.key`` or of what is below (``model.holes.0.width``).
+
+    Mappings and lists on the way are copied, and keep the rest. Returns the path. Raises
+    ConfigurationError if there is nothing on the way that could hold the value.
+    """
+    inner: Any = data
+    path: list[str | int] = []
+    *way, last = key.split(".")
+    for part, below in zip(way, [*way[1:], last], strict=True):
+        path.append(int(part) if isinstance(inner, list) else part)
+        # What these hold where a file lacks them is known: nothing. What a constructor has by
+        # default is not, and would be lost.
+        is_empty = len(path) == 1 or path == ["environment", "arguments"]
+        is_there = isinstance(inner, list) or part in inner
+        held: Any = inner[path[-1]] if is_there else {} if is_empty else None
+        is_item = isinstance(held, list) and below.isdecimal() and int(below) < len(held)
+        if not is_item and not isinstance(held, Mapping):
+            whole = dotted(tuple(path))
+            what = "is not in the file" if held is None else f"is {shown(held)}"
+            raise ConfigurationError(
+                f"{key} cannot be set alone, for {whole} {what}; set all of it: --set '{whole}=...'"
+            )
+        inner[path[-1]] = list(held) if is_item else dict(held)
+        inner = inner[path[-1]]
+    path.append(int(last) if isinstance(inner, list) else last)
+    inner[path[-1]] = value
+    return tuple(path)
 
 
 def with_names_of_today(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -224,10 +236,16 @@ def module_directory(source: Source, key: KeyPath, value: str | None, module: st
     if value is not None:
         directory = source.directory_of(key) / value
         if not directory.is_dir():
-            raise source.error(key, f"is {shown(value)}, where there is no directory")
-        if not _holds(directory, package):
-            raise source.error(key, f"is {shown(value)}, where there is no module {package}")
-        return directory.resolve()
+            what = "no directory"
+        elif not _holds(directory, package):
+            what = f"no module {package}"
+        else:
+            return directory.resolve()
+        raise source.error(
+            key,
+            f"is {shown(value)}, where there is {what}; say where the module lies on this machine: "
+            + ("--problem-directory DIR" if len(key) == 1 else f"--set {dotted(key)}=DIR"),
+        )
     places = (source.directory, source.current)
     return next((directory for directory in places if _holds(directory, package)), None)
 

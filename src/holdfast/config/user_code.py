@@ -84,6 +84,13 @@ def account_of_user_error(error: BaseException, name: str) -> str | None:
     return f"{name} raised {in_words(error)}\n{where}"
 
 
+def is_of_user(error: BaseException | None) -> bool:
+    """Return whether an error, or what has caused it, was raised by the user's code."""
+    if error is None:
+        return False
+    return account_of_user_error(error, "") is not None or is_of_user(error.__cause__)
+
+
 def in_words(error: BaseException) -> str:
     """Return an error's type and message, cut to a length that a person reads."""
     kind = type(error).__name__

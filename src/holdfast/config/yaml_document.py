@@ -22,6 +22,7 @@ from typing import Any, cast
 import yaml
 
 from holdfast.errors import ConfigurationError
+from holdfast.printable import brief
 from holdfast.validation import KeyPath, dotted
 
 MAX_BYTES = 1024 * 1024
@@ -223,7 +224,7 @@ def _scalar(node: yaml.ScalarNode) -> Any:
     if node.tag == _STR:
         # An escape ("\\ud800") can make half a character, which no file or terminal takes.
         if any("\ud800" <= character <= "\udfff" for character in text):
-            raise _RefusedError(f"{text!r:.80} holds half a character", node.start_mark)
+            raise _RefusedError(f"{brief(text)} holds half a character", node.start_mark)
         return text
     if node.tag == _AMBIGUOUS:
         raise _RefusedError(
@@ -235,7 +236,7 @@ def _scalar(node: yaml.ScalarNode) -> Any:
     patterns = dict(_PLAIN_SCALARS)
     if node.tag not in patterns or re.match(patterns[node.tag], text) is None:
         raise _RefusedError(
-            f"the tag {node.tag} is not allowed on {text!r:.80}; write plain values",
+            f"the tag {node.tag} is not allowed on {brief(text)}; write plain values",
             node.start_mark,
         )
     if node.tag == _NULL:

@@ -21,15 +21,8 @@ from typing import Any
 import msgspec
 
 from holdfast.errors import OutputError
-from holdfast.journal.journal_file import (
-    START_ANEW,
-    Entry,
-    Finished,
-    Notes,
-    Steps,
-    damaged,
-    packed,
-)
+from holdfast.journal.journal_file import START_ANEW, Entry, Finished, Notes, Steps, damaged, packed
+from holdfast.printable import brief
 
 _SCHEMA_VERSION = "3"
 _NUMBERS = struct.Struct("<qq")
@@ -78,7 +71,7 @@ class _Rows:
         # be computed, without end. Nothing is asked of it before this.
         for name, sql in self._ask("SELECT name, sql FROM sqlite_schema"):
             if not str(sql).startswith(f"CREATE TABLE {name} (") or " AS " in sql:
-                raise damaged(self._path, f"{name!r:.80} in it is no table of a journal")
+                raise damaged(self._path, f"{brief(name)} in it is no table of a journal")
         (found,) = self._ask("PRAGMA quick_check(1)").fetchone()
         if found != "ok":
             raise damaged(self._path, str(found).strip().splitlines()[-1])

@@ -26,12 +26,7 @@ from holdfast.config.loader import Configuration
 from holdfast.config.source import SETTINGS, with_names_of_today
 from holdfast.config.user_code import describe_problem_error
 from holdfast.errors import DecidedOtherwiseError, OutputError, RebootedError
-from holdfast.journal.fingerprint import (
-    EarlierCode,
-    difference,
-    fingerprint,
-    read_earlier,
-)
+from holdfast.journal.fingerprint import EarlierCode, difference, fingerprint, read_earlier
 from holdfast.journal.journal import Journal
 from holdfast.journal.journal_file import (
     JOURNAL_NAME,

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from holdfast.errors import InvalidValueError
-from holdfast.printable import one_line
+from holdfast.printable import brief
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -54,7 +54,7 @@ def in_brief(values: object) -> str:
     try:
         array = np.asarray(values)
     except (TypeError, ValueError):
-        return f"{one_line(repr(values)):.80}"  # A ragged list.
+        return f"{brief(values)}"  # A ragged list.
     return np.array2string(array, max_line_width=sys.maxsize, threshold=2 * _EDGE, edgeitems=_EDGE)
 
 
@@ -110,7 +110,7 @@ def whole(what: str, value: object, least: int, most: int | None = None) -> int:
     if number is None or number < least or (most is not None and number > most):
         limits = f"from {least}" if most is None else f"from {least} to {most}"
         came = value if number is None else number
-        raise InvalidValueError(f"{what} {came!r:.80}: allowed are whole numbers {limits}")
+        raise InvalidValueError(f"{what} {brief(came)}: allowed are whole numbers {limits}")
     return number
 
 
@@ -118,9 +118,7 @@ def floats(what: str, value: object) -> FloatArray:
     """Return real numbers as float64, in C order; otherwise InvalidValueError names ``what``."""
     numbers = real_numbers(value)
     if numbers is None:
-        raise InvalidValueError(
-            f"{what} is {one_line(repr(value)):.80}: must be real numbers {NOTHING_ELSE}"
-        )
+        raise InvalidValueError(f"{what} is {brief(value)}: must be real numbers {NOTHING_ELSE}")
     return np.ascontiguousarray(numbers, dtype=np.float64).reshape(numbers.shape)
 
 

@@ -21,16 +21,8 @@ import numpy.typing as npt
 
 from holdfast import _kernel
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.numerics.arrays import (
-    FloatArray,
-    IntArray,
-    floats,
-    in_brief,
-    integer,
-    is_masked,
-    real_numbers,
-    whole,
-)
+from holdfast.numerics import arrays
+from holdfast.printable import brief
 
 Words: TypeAlias = tuple[int, int, int, int, int]
 
@@ -108,11 +100,11 @@ class Stream:
         self._call = _Call() if call is None else call
         self._draws = self._motions = 0
 
-    def standard_normal(self, size: Size | None = None) -> FloatArray:
+    def standard_normal(self, size: Size | None = None) -> arrays.FloatArray:
         """Return standard normal deviates."""
         return _shaped(self._normals, size)
 
-    def random(self, size: Size | None = None) -> FloatArray:
+    def random(self, size: Size | None = None) -> arrays.FloatArray:
         """Return numbers that are uniform on [0, 1)."""
         return _shaped(self._uniforms, size)
 
@@ -123,7 +115,7 @@ class Stream:
         scale: npt.ArrayLike | None = None,
         size: Size | None = None,
         shape: Size | None = None,
-    ) -> FloatArray:
+    ) -> arrays.FloatArray:
         """Return normal deviates: ``normal(loc=0.0, scale=1.0, size=None)``, as NumPy's.
 
         One argument alone is a shape, an integer or a tuple of them: ``normal((n, 3))``. NumPy
@@ -138,7 +130,7 @@ class Stream:
         mean, deviation = _number("loc", mean, 0.0), _number("scale", deviation, 1.0)
         # A comparison with NaN is false.
         if not (deviation >= 0.0).all():
-            raise InvalidValueError(f"normal: scale is {in_brief(deviation)}, must be >= 0")
+            raise InvalidValueError(f"normal: scale is {arrays.in_brief(deviation)}, must be >= 0")
         return _spread(self._normals, "loc and scale", mean, deviation, size)
 
     def uniform(
@@ -148,7 +140,7 @@ class Stream:
         high: npt.ArrayLike | None = None,
         size: Size | None = None,
         shape: Size | None = None,
-    ) -> FloatArray:
+    ) -> arrays.FloatArray:
         """Return numbers uniform on [low, high): ``uniform(low=0.0, high=1.0, size=None)``.
 
         One argument alone is a shape, as for :meth:`normal`.
@@ -163,7 +155,7 @@ class Stream:
         # Comparisons with NaN are false.
         if not ((width >= 0.0) & (width < math.inf)).all():
             raise InvalidValueError(
-                f"uniform: high less low is {in_brief(width)}, must be >= 0 and finite"
+                f"uniform: high less low is {arrays.in_brief(width)}, must be >= 0 and finite"
             )
         return _spread(self._uniforms, "low and high", least, width, size)
 
@@ -174,7 +166,7 @@ class Stream:
         size: Size | None = None,
         *,
         endpoint: bool = False,
-    ) -> IntArray:
+    ) -> arrays.IntArray:
         """Return integers from ``low`` to below ``high``, all alike; with ``endpoint``, to it.
 
         Without ``high`` they are from 0 to below ``low``. A range has at most 2**53 integers. None
@@ -188,11 +180,11 @@ class Stream:
         shape = _shape(size) if size is not None else counts.shape
         if counts.size and 0 not in shape and not 1 <= counts.min() <= counts.max() <= _UNIFORMS:
             raise InvalidValueError(
-                f"integers from {low!r:.40} to {high!r:.40}: a range must have 1 to 2**53 of them"
+                f"integers from {brief(low)} to {brief(high)}: a range must have 1 to 2**53 of them"
             )
         least, many = (_fitted("low and high", each, shape).reshape(-1) for each in (first, counts))
         found = (least + self._below(many)).reshape(shape)
-        return cast(IntArray, _unwrapped(found, size))
+        return cast(arrays.IntArray, _unwrapped(found, size))
 
     def choice(
         self,
@@ -206,8 +198,8 @@ class Stream:
         ``p`` are their probabilities; without it all are alike. Without ``replace`` an entry is
         drawn at most once; it does not go with ``p``.
         """
-        if is_masked(a):
-            raise InvalidValueError(f"a {in_brief(a)}: must have no masked entry")
+        if arrays.is_masked(a):
+            raise InvalidValueError(f"a {arrays.in_brief(a)}: must have no masked entry")
         entries = np.asarray(a)
         if entries.ndim == 0:
             entries = np.arange(int(_whole("a", a)))
@@ -237,7 +229,7 @@ class Stream:
         (:mod:`holdfast.numerics.geometry`) draws from substreams 0 to 999 of the stream that it is
         given: if you use substreams too, give it one of them.
         """
-        index = whole("substream index", index, 0, _WORD - 1)
+        index = arrays.whole("substream index", index, 0, _WORD - 1)
         self._require_open()
         return Stream(_kernel.substream(self.words, index), self._call)
 
@@ -259,13 +251,13 @@ class Stream:
         """Refuse all further draws, of what came from it too: the call that it is for is over."""
         self._call.has_ended = True
 
-    def _normals(self, count: int) -> FloatArray:
+    def _normals(self, count: int) -> arrays.FloatArray:
         return _kernel.normals(self._for_draw(), count)
 
-    def _uniforms(self, count: int) -> FloatArray:
+    def _uniforms(self, count: int) -> arrays.FloatArray:
         return _kernel.uniforms(self._for_draw(), count)
 
-    def _below(self, counts: IntArray) -> IntArray:
+    def _below(self, counts: arrays.IntArray) -> arrays.IntArray:
         """Return integers from 0 to below each of ``counts``, shape (n,)."""
         found = np.empty(counts.shape, dtype=np.int64)
         open_ones = np.arange(counts.size)
@@ -333,15 +325,15 @@ class NoiseFreeStream(Stream):
                 "give the problem an expected_move(states, actions), which path_entropy uses"
             )
 
-    def _normals(self, count: int) -> FloatArray:
+    def _normals(self, count: int) -> arrays.FloatArray:
         self._count()
         return np.zeros(count)
 
-    def _uniforms(self, count: int) -> FloatArray:
+    def _uniforms(self, count: int) -> arrays.FloatArray:
         self._count()
         return np.full(count, 0.5)
 
-    def _below(self, counts: IntArray) -> IntArray:
+    def _below(self, counts: arrays.IntArray) -> arrays.IntArray:
         self._count()
         return np.asarray((counts - 1) // 2)
 
@@ -380,7 +372,7 @@ NOISE_FREE = NoiseFreeStream()
 
 def seed_and_trial(seed: object, trial: object) -> tuple[int, int]:
     """Return what a user gave as whole numbers that :func:`stream` allows; else it raises."""
-    return whole("seed", seed, 0, 2**63 - 1), whole("trial", trial, 0, _WORD - 1)
+    return arrays.whole("seed", seed, 0, 2**63 - 1), arrays.whole("trial", trial, 0, _WORD - 1)
 
 
 def stream(seed: int, trial: int, step: int, purpose: Purpose) -> Stream:
@@ -401,10 +393,10 @@ def _shape(size: object) -> tuple[int, ...]:
     if size is None:
         return ()
     extents: Iterable[Any] = size if isinstance(size, Iterable) else (size,)
-    found = [integer(extent) for extent in extents]
+    found = [arrays.integer(extent) for extent in extents]
     shape = tuple(extent for extent in found if extent is not None)
     if len(shape) < len(found):
-        raise InvalidValueError(f"size {size!r:.40}: must be an integer or a tuple of integers")
+        raise InvalidValueError(f"size {brief(size)}: must be an integer or a tuple of integers")
     if any(extent < 0 for extent in shape):
         raise InvalidValueError(f"shape {size}: no extent may be negative")
     return shape
@@ -422,24 +414,24 @@ def _unwrapped(drawn: Any, size: object) -> Any:
     return drawn[()] if size is None else drawn
 
 
-def _shaped(draw: Callable[[int], FloatArray], size: Size | None) -> FloatArray:
+def _shaped(draw: Callable[[int], arrays.FloatArray], size: Size | None) -> arrays.FloatArray:
     shape = _shape(size)
     drawn = draw(_size(shape)).reshape(shape)
-    return cast(FloatArray, _unwrapped(drawn, size))
+    return cast(arrays.FloatArray, _unwrapped(drawn, size))
 
 
 def _spread(
-    draw: Callable[[int], FloatArray],
+    draw: Callable[[int], arrays.FloatArray],
     what: str,
-    base: FloatArray,
-    width: FloatArray,
+    base: arrays.FloatArray,
+    width: arrays.FloatArray,
     size: Size | None,
-) -> FloatArray:
+) -> arrays.FloatArray:
     """Return ``base + width * drawn``, of the given size or as the two broadcast."""
     shape = np.broadcast_shapes(base.shape, width.shape) if size is None else _shape(size)
     base, width = (_fitted(what, each, shape) for each in (base, width))
-    drawn: FloatArray = base + width * draw(_size(shape)).reshape(shape)
-    return cast(FloatArray, _unwrapped(drawn, size))
+    drawn: arrays.FloatArray = base + width * draw(_size(shape)).reshape(shape)
+    return cast(arrays.FloatArray, _unwrapped(drawn, size))
 
 
 def _fitted(what: str, values: Any, shape: tuple[int, ...]) -> Any:
@@ -451,23 +443,25 @@ def _fitted(what: str, values: Any, shape: tuple[int, ...]) -> Any:
         ) from None
 
 
-def _number(name: str, value: npt.ArrayLike | None, default: float) -> FloatArray:
-    return floats(name, default if value is None else value)
+def _number(name: str, value: npt.ArrayLike | None, default: float) -> arrays.FloatArray:
+    return arrays.floats(name, default if value is None else value)
 
 
-def _whole(name: str, value: npt.ArrayLike) -> IntArray:
-    array = real_numbers(value)
+def _whole(name: str, value: npt.ArrayLike) -> arrays.IntArray:
+    array = arrays.real_numbers(value)
     if array is None or (
         array.size > 0
         and (
             array.dtype.kind == "f" or not -(2**62) <= int(array.min()) <= int(array.max()) <= 2**62
         )
     ):
-        raise InvalidValueError(f"{name} {in_brief(value)}: must be integers from -2**62 to 2**62")
+        raise InvalidValueError(
+            f"{name} {arrays.in_brief(value)}: must be integers from -2**62 to 2**62"
+        )
     return array.astype(np.int64)
 
 
-def _cumulated(p: npt.ArrayLike, count: int) -> FloatArray:
+def _cumulated(p: npt.ArrayLike, count: int) -> arrays.FloatArray:
     """Return the cumulated probabilities, of which the last is 1."""
     shares = _number("p", p, 0.0)
     # np.cumsum adds one by one, in order, unlike np.sum.
@@ -480,16 +474,13 @@ def _cumulated(p: npt.ArrayLike, count: int) -> FloatArray:
         or not abs(sums[-1] - 1.0) < 1e-6
     ):
         raise InvalidValueError(
-            f"p {in_brief(shares)}: must be {count} probabilities, not negative and of sum 1"
+            f"p {arrays.in_brief(shares)}: must be {count} probabilities, not negative and of sum 1"
         )
     return np.asarray(sums / sums[-1])
 
 
 def _parameters(
-    what: str,
-    names: tuple[str, str],
-    positional: tuple[Any, ...],
-    named: tuple[Any, Any, Any],
+    what: str, names: tuple[str, str], positional: tuple[Any, ...], named: tuple[Any, Any, Any]
 ) -> tuple[Any, Any, Any]:
     """Return the two parameters of a distribution, None where not given, and the size."""
     if not positional:
@@ -504,7 +495,7 @@ def _parameters(
         if is_shape and named == (None, None, None):
             return None, None, lone
         raise InvalidValueError(
-            f"{what}({lone!r:.40}): is this the shape, or {names[0]}? Name it: size=... or "
+            f"{what}({brief(lone)}): is this the shape, or {names[0]}? Name it: size=... or "
             f"{names[0]}=..."
         )
     if len(positional) > 3 or any(each is not None for each in named[: len(positional)]):

@@ -152,11 +152,7 @@ class ObservationInfo(NamedTuple):
     distinct_particles: int = 0
 
 
-def estimate(
-    belief: Belief,
-    kind: Estimate = "mean",
-    circular: Sequence[int] = (),
-) -> FloatArray:
+def estimate(belief: Belief, kind: Estimate = "mean", circular: Sequence[int] = ()) -> FloatArray:
     """Return a point estimate of the state, shape ``(state_size,)``.
 
     It is the mean, the mean of the heaviest mode (:mod:`holdfast.planning.modes`), or the particle

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from holdfast.errors import InvalidValueError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.inputs import ActingRecord, Decision, Sensed
-from holdfast.printable import one_line
+from holdfast.printable import brief, one_line
 from holdfast.problems.attributes import sensing_costs
 
 Outcome: TypeAlias = Literal["succeeded", "failed", "truncated"]
@@ -66,7 +66,7 @@ def ending_of(done: object) -> Ending | None:
     if isinstance(done, Ending) and isinstance(done.reason, str) and done.outcome in _OUTCOMES:
         reason = one_line(done.reason)
         return Ending(done.outcome, reason[:MAX_REASON])
-    raise InvalidValueError(f"returned {done!r:.80}; it must return {DONE_VALUES}")
+    raise InvalidValueError(f"returned {brief(done)}; it must return {DONE_VALUES}")
 
 
 _OUTCOMES = ("succeeded", "failed", "truncated")

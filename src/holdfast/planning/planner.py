@@ -50,12 +50,7 @@ from holdfast.planning.belief import (
     update_by_move,
 )
 from holdfast.planning.sensing import SensingInfo
-from holdfast.planning.settings import (
-    MAX_PARTICLES,
-    Method,
-    PlanningSettings,
-    check_settings,
-)
+from holdfast.planning.settings import MAX_PARTICLES, Method, PlanningSettings, check_settings
 from holdfast.problems import checked
 from holdfast.problems.attributes import (
     check_problem,
@@ -349,10 +344,7 @@ class Planner:
 
     @in_own_mode
     def advance(
-        self,
-        state: PlanningState,
-        task_action: FloatArray,
-        motion: npt.ArrayLike | None = None,
+        self, state: PlanningState, task_action: FloatArray, motion: npt.ArrayLike | None = None
     ) -> PlanningState:
         """Predict the belief by a performed task action and go to the next step.
 

@@ -113,6 +113,16 @@ def _followed(
     return states_at, stages_at if several_stages else stage
 
 
+def nats_of_halving(settings: PlanningSettings) -> float:
+    """Return by how much the score falls if the spread of one coordinate is halved, in nats.
+
+    An entropy falls by log 2. ``path_entropy`` adds up several, by default 1 + 1/2 of them.
+    """
+    own = settings.selector
+    weights = _factors(own.path_offsets, own.path_discount)
+    return float(np.log(2.0)) * (sum(weights) if own.method == "path_entropy" else 1.0)
+
+
 def _factors(offsets: tuple[int, ...], discount: float) -> tuple[float, ...]:
     """Return ``discount**offset`` by multiplication, which has the same bits everywhere."""
     factors = []

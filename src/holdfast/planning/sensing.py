@@ -32,35 +32,13 @@ from holdfast.numerics import reproducible as numerics
 from holdfast.numerics.arrays import FloatArray, IntArray, in_brief
 from holdfast.numerics.circular import embedded, unwrapped
 from holdfast.numerics.randomness import Stream, Words
-from holdfast.planning import interruption
+from holdfast.planning import estimators, interruption
 from holdfast.planning.belief import Belief, estimate
 from holdfast.planning.dominance import dominated
-from holdfast.planning.estimators import (
-    LARGEST,
-    TOTAL_VARIANCE,
-    EstimatorKind,
-    GaussianMixture,
-    KernelEstimator,
-    NearestNeighbor,
-    first_unbounded,
-    kernel_estimator,
-    scale_of,
-    scaled,
-)
 from holdfast.planning.expected_return import expected_returns
 from holdfast.planning.policy_path import path_points
 from holdfast.planning.settings import NEIGHBOR_ESTIMATORS, PlanningSettings, estimator_of
-from holdfast.problems import checked
-from holdfast.problems.attributes import (
-    circular_actions,
-    circular_observation,
-    circular_states,
-    has_batched_likelihoods,
-    has_circular_observations,
-    has_general_observations,
-    resolution_of,
-    sensing_costs,
-)
+from holdfast.problems import attributes, checked
 from holdfast.problems.problem import Problem
 
 # Substreams of the stream of hypotheses; 1 is the kernel's own, for the observation noise.
@@ -138,7 +116,7 @@ def predict(
         sets, factors = path_points(problem, settings, states, stage)
     else:
         sets, factors = _points_of(problem, settings)(states, stage)[np.newaxis], (1.0,)
-    if has_general_observations(problem):
+    if attributes.has_general_observations(problem):
         return Predictions(sets, factors, None)
     every = range(len(problem.sensing_actions))
     return Predictions(sets, factors, checked.predictions(problem, states, every))
@@ -203,7 +181,11 @@ def choose_sensing_action(
     threads, size = sensing.num_cores, sensing.num_observation_samples
     hypothetical = _hypotheses_of(problem, belief, shown)(range(count), size, hypotheses)
     entropies, samples, likelihoods, visits = hypothetical.entropies(
-        scaled(points, estimator), estimator, threads, factors, selector.sensing_is_optional
+        estimators.scaled(points, estimator),
+        estimator,
+        threads,
+        factors,
+        selector.sensing_is_optional,
     )
     if sensing.horizon > 1 and not np.isnan(entropies).any():
         weights = hypothetical.weights(estimator.drops_negligible)
@@ -256,7 +238,7 @@ def _prices(problem: Problem, settings: PlanningSettings) -> FloatArray | None:
     if rate == 0.0:
         return None
     optional = settings.selector.sensing_is_optional
-    return rate * sensing_costs(problem, otherwise=1.0, optional=optional)
+    return rate * attributes.sensing_costs(problem, otherwise=1.0, optional=optional)
 
 
 def _with_unchanged(weights: FloatArray, same: FloatArray) -> FloatArray:
@@ -323,7 +305,9 @@ def _points_of(
 def _on_a_line(problem: Problem, settings: PlanningSettings, sets: FloatArray) -> FloatArray:
     """Return sets of points, shape (..., n, d), as the kernel takes them, which knows no angles."""
     method = settings.selector.method
-    angles = circular_states if method == "state_entropy" else circular_actions
+    angles = (
+        attributes.circular_states if method == "state_entropy" else attributes.circular_actions
+    )
     if not (circular := angles(problem)):
         return sets
     return (embedded if method == "action_covariance" else unwrapped)(sets, circular)
@@ -331,37 +315,39 @@ def _on_a_line(problem: Problem, settings: PlanningSettings, sets: FloatArray) -
 
 def _estimator(
     problem: Problem, settings: PlanningSettings, belief: Belief, points: FloatArray
-) -> KernelEstimator:
+) -> estimators.KernelEstimator:
     _require_bounded(problem, points, belief.states, "state")
     dimension = points.shape[1]
     selector = settings.selector
     of_states = selector.method == "state_entropy"
-    resolution = resolution_of(problem, selector.resolution, of_states=of_states)
+    resolution = attributes.resolution_of(problem, selector.resolution, of_states=of_states)
     each_its_own = not isinstance(resolution, (int, float))
     if selector.method == "action_covariance":
         if not each_its_own:
-            return TOTAL_VARIANCE
-        scale, _ = scale_of(np.asarray(resolution), dimension)
+            return estimators.TOTAL_VARIANCE
+        scale, _ = estimators.scale_of(np.asarray(resolution), dimension)
         # An angle has two coordinates there.
-        scale = np.concatenate([scale, scale[list(circular_actions(problem))]])
-        return TOTAL_VARIANCE._replace(scale=scale)
+        scale = np.concatenate([scale, scale[list(attributes.circular_actions(problem))]])
+        return estimators.TOTAL_VARIANCE._replace(scale=scale)
     kind = estimator_of(selector, points.shape[0])
     if kind in NEIGHBOR_ESTIMATORS:
         neighbors = settings.active_sensing.num_nearest_neighbors
-        nearest = kernel_estimator if each_its_own else _kept_estimator
-        found = nearest(NearestNeighbor(neighbors, resolution), dimension)
+        nearest = estimators.kernel_estimator if each_its_own else _kept_estimator
+        found = nearest(estimators.NearestNeighbor(neighbors, resolution), dimension)
         if kind == "nearest_neighbor":
             return found
-        return found._replace(kind=EstimatorKind.PRIOR_NEIGHBORS, prior=belief.weights)
+        return found._replace(kind=estimators.EstimatorKind.PRIOR_NEIGHBORS, prior=belief.weights)
     upper = kind == "gaussian_mixture_upper"
     own = np.full(dimension, resolution * resolution)
     states_have_their_own = of_states and getattr(problem, "state_resolution", None) is not None
     if selector.resolution is None and not states_have_their_own:
         own = _noise_variance(problem, own)
-    return kernel_estimator(GaussianMixture(own, upper), dimension, split_volume=each_its_own)
+    return estimators.kernel_estimator(
+        estimators.GaussianMixture(own, upper), dimension, split_volume=each_its_own
+    )
 
 
-_kept_estimator = functools.lru_cache(maxsize=100)(kernel_estimator)
+_kept_estimator = functools.lru_cache(maxsize=100)(estimators.kernel_estimator)
 
 
 def _noise_variance(problem: Problem, own: FloatArray) -> FloatArray:
@@ -377,11 +363,11 @@ def _noise_variance(problem: Problem, own: FloatArray) -> FloatArray:
 
 
 def _require_bounded(problem: Problem, points: FloatArray, states: FloatArray, which: str) -> None:
-    if (bad := first_unbounded(points)) is not None:
+    if (bad := estimators.first_unbounded(points)) is not None:
         raise ProblemError(
             f"policy of {problem.name} returned {in_brief(points[bad])} in {which} "
             f"{in_brief(states[bad])}: every coordinate must be finite and at most "
-            f"{LARGEST:g}"
+            f"{estimators.LARGEST:g}"
         )
 
 
@@ -399,7 +385,7 @@ class _GaussianHypotheses(NamedTuple):
     def entropies(
         self,
         points: FloatArray,
-        estimator: KernelEstimator,
+        estimator: estimators.KernelEstimator,
         threads: int,
         factors: tuple[float, ...],
         unchanged: bool,
@@ -439,7 +425,7 @@ class _GeneralHypotheses(NamedTuple):
     def entropies(
         self,
         points: FloatArray,
-        estimator: KernelEstimator,
+        estimator: estimators.KernelEstimator,
         threads: int,
         factors: tuple[float, ...],
         unchanged: bool,
@@ -467,19 +453,17 @@ class _GeneralHypotheses(NamedTuple):
 
 
 def _hypotheses_of(
-    problem: Problem,
-    belief: Belief,
-    shown: tuple[list[int], FloatArray, FloatArray] | None = None,
+    problem: Problem, belief: Belief, shown: tuple[list[int], FloatArray, FloatArray] | None = None
 ) -> Callable[[Sequence[int], int, Stream], _GaussianHypotheses | _GeneralHypotheses]:
     """Return what draws hypothetical observations of some sensing actions, so many of each."""
-    if has_general_observations(problem):
+    if attributes.has_general_observations(problem):
         return functools.partial(_general_hypotheses, problem, belief)
     every = range(len(problem.sensing_actions))
     sizes, predicted, variances = shown or checked.predictions(problem, belief.states, every)
     angles: list[int] = []
-    if has_circular_observations(problem):
+    if attributes.has_circular_observations(problem):
         for action, size in zip(every, sizes, strict=True):
-            own = circular_observation(problem, action, size)
+            own = attributes.circular_observation(problem, action, size)
             angles += [int(coordinate in own) for coordinate in range(size)]
 
     def draw(actions: Sequence[int], samples: int, stream: Stream) -> _GaussianHypotheses:
@@ -506,7 +490,7 @@ def _general_hypotheses(
     log_prior = numerics.log(belief.weights)
     particles = _kernel.stratified(belief.weights, samples, stream.words)
     streams = stream.substream(_GENERAL_OBSERVATIONS)
-    together = has_batched_likelihoods(problem)
+    together = attributes.has_batched_likelihoods(problem)
     rows = np.empty((len(actions), samples, len(log_prior)))
     for own_rows, action in zip(rows, actions, strict=True):
         observations = []
@@ -531,7 +515,7 @@ def _later_entropies(
     weights: FloatArray,
     stage: int,
     hypotheses: Stream,
-    estimator: KernelEstimator,
+    estimator: estimators.KernelEstimator,
     points_of: Callable[[FloatArray, int], FloatArray],
 ) -> FloatArray:
     """Return the discounted entropies of the steps after the first, shape (J, M).
@@ -561,7 +545,7 @@ def _later_entropies(
                 estimated = estimate(
                     Belief(states[row], each),
                     settings.particle_filter.estimate,
-                    circular_states(problem),
+                    attributes.circular_states(problem),
                 )
                 stages[row] = checked.next_stage(problem, estimated, stages[row])
                 commanded = checked.policy(problem, estimated, stages[row])
@@ -574,7 +558,7 @@ def _later_entropies(
             flat_states = states.reshape(-1, states.shape[-1])
             _require_bounded(problem, points, flat_states, "the predicted state")
             sets = _on_a_line(problem, settings, points.reshape(len(own), -1, points.shape[1]))
-            rows_of_points = scaled(sets.reshape(-1, sets.shape[-1]), estimator)
+            rows_of_points = estimators.scaled(sets.reshape(-1, sets.shape[-1]), estimator)
             later[block] += factor * _kernel.entropies_of_each(
                 rows_of_points.reshape(sets.shape),
                 own,

@@ -34,16 +34,7 @@ from holdfast.planning.belief import (
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.sensing import choose_sensing_action, predict
 from holdfast.planning.settings import UNINFORMED_METHODS
-from holdfast.problems import checked
-from holdfast.problems.attributes import (
-    circular_observation,
-    circular_states,
-    has_general_observations,
-    has_own,
-    moves_give_observations,
-    sensing_action_of,
-    static_parameters,
-)
+from holdfast.problems import attributes, checked
 
 
 def can_decide_together(planner: Planner) -> bool:
@@ -54,10 +45,10 @@ def can_decide_together(planner: Planner) -> bool:
     problem = planner.problem
     return (
         type(problem).__module__.startswith("holdfast.problems.")
-        and has_own(problem, "move_each", ("move",))
-        and not has_general_observations(problem)
-        and not moves_give_observations(problem)
-        and not static_parameters(problem)
+        and attributes.has_own(problem, "move_each", ("move",))
+        and not attributes.has_general_observations(problem)
+        and not attributes.moves_give_observations(problem)
+        and not attributes.static_parameters(problem)
     )
 
 
@@ -74,7 +65,7 @@ def observe_together(
     threshold = planner.settings.particle_filter.resampling_threshold * count
     for action, rows in _alike(sensing_actions):
         interruption.check()
-        chosen = sensing_action_of(problem, action)
+        chosen = attributes.sensing_action_of(problem, action)
         beliefs = [states[row].belief for row in rows]
         weights = np.array([belief.weights for belief in beliefs])
         mean, variance = checked.prediction(problem, _stacked(beliefs), chosen)
@@ -82,7 +73,7 @@ def observe_together(
         observed = np.array([[finite(observations[row])] for row in rows])
         if observed.shape[-1] != mean.shape[-1]:
             raise InvalidValueError(f"observations that sensing action {action} does not give")
-        angles = circular_observation(problem, chosen, mean.shape[-1])
+        angles = attributes.circular_observation(problem, chosen, mean.shape[-1])
         likelihoods, _ = gaussian_log_likelihood(observed, mean, variance, angles)
         log_weights = numerics.log(weights) + likelihoods
         for row, belief, own in zip(rows, beliefs, log_weights, strict=True):
@@ -104,7 +95,7 @@ def plan_together(
 ) -> list[tuple[list[FloatArray], PlanningState]]:
     """Return what :meth:`Planner.plan_until_sensing` does for each state."""
     problem, settings = planner.problem, planner.settings
-    kind, circular = settings.particle_filter.estimate, circular_states(problem)
+    kind, circular = settings.particle_filter.estimate, attributes.circular_states(problem)
     planned: list[list[FloatArray]] = [[] for _ in states]
     ahead = list(states)
 

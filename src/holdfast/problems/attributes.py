@@ -23,6 +23,7 @@ import numpy as np
 from holdfast.earlier_names import EARLIER_NAMES, warn_of_earlier_name
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.numerics.arrays import FloatArray, in_brief, integer, real_numbers
+from holdfast.printable import brief
 
 MAX_SENSING_COST = 1e150
 """So that no sum of prices, and no square of one, is too large for a float."""
@@ -90,7 +91,7 @@ def check_problem(problem: Any) -> None:
         raise ProblemError(f"{name} has no {' and no '.join(missing)}{misspelt_in(problem)}")
     if not sensing_labels(problem):
         raise ProblemError(
-            f"sensing_actions of {name} is {getattr(problem, 'sensing_actions', ())!r:.80}: must "
+            f"sensing_actions of {name} is {brief(getattr(problem, 'sensing_actions', ()))}: must "
             "be a sequence of labels, not empty"
         )
     sensing_costs(problem)
@@ -112,11 +113,10 @@ def check_problem(problem: Any) -> None:
             f"motion_variance of {name} is {in_brief(variance)}: must be {problem.action_size} "
             "numbers >= 0"
         )
-    given = [
-        function
-        for function in ("log_likelihood", "sample_observation")
-        if hasattr(problem, function)
-    ]
+    if not isinstance(ranks := getattr(problem, "rank_test", False), bool | np.bool_):
+        raise ProblemError(f"rank_test of {name} is {brief(ranks)}: must be True or False")
+    both = ("log_likelihood", "sample_observation")
+    given = [function for function in both if hasattr(problem, function)]
     if not given and hasattr(problem, "log_likelihoods"):
         given = ["log_likelihoods"]
     if len(given) == 1:
@@ -217,13 +217,13 @@ def _check_coordinates(problem: Any) -> None:
     count = len(problem.sensing_actions)
     if has_general_observations(problem):
         raise ProblemError(
-            f"circular_observations of {name} is {given!r:.80}: it has no effect beside "
+            f"circular_observations of {name} is {brief(given)}: it does nothing beside "
             "log_likelihood, which has to know itself what is an angle; leave it out"
         )
     if own is None or len(own) != count:
         raise ProblemError(
-            f"circular_observations of {name} is {given!r:.80}: must be {count} sequences, one for "
-            "each sensing action, of the coordinates of its observation that are angles"
+            f"circular_observations of {name} is {brief(given)}: must be {count} sequences, one of "
+            "each sensing action, with the coordinates of its observation that are angles"
         )
     for action, each in enumerate(own):
         _require_indices(name, f"circular_observations[{action}]", each, None)
@@ -247,7 +247,7 @@ def _require_indices(
     if not usable:
         limit = "" if size is None else f" to {size - 1}"
         raise ProblemError(
-            f"{attribute} of {name} is {given!r:.80}: must be different indices of coordinates "
+            f"{attribute} of {name} is {brief(given)}: must be different indices of coordinates "
             f"that {what}, from 0{limit}, such as (0,)"
         )
 
@@ -270,7 +270,7 @@ def sensing_labels(problem: Any) -> tuple[str, ...]:
     for label in labels:
         if not isinstance(label, str):
             raise ProblemError(
-                f"sensing_actions of {name_of(problem)} has {label!r:.80}: labels must be text"
+                f"sensing_actions of {name_of(problem)} has {brief(label)}: labels must be text"
             )
     return tuple(map(str, labels))
 
@@ -284,7 +284,7 @@ def sensing_action_of(problem: Any, given: object, *, optional: bool = False) ->
     chosen = integer(given)
     if chosen is None or not 0 <= chosen < count + optional:
         raise InvalidValueError(
-            f"sensing action {given!r:.80}: {problem.name} has 0 to {count - 1}"
+            f"sensing action {brief(given)}: {problem.name} has 0 to {count - 1}"
         )
     return chosen
 
@@ -298,7 +298,7 @@ def state_labels(problem: Any) -> tuple[str, ...]:
     labels = () if given is None else sequence_of(given)
     if labels is None:
         raise ProblemError(
-            f"state_labels of {name_of(problem)} is {given!r:.80}: must be a sequence of labels, "
+            f"state_labels of {name_of(problem)} is {brief(given)}: must be a sequence of labels, "
             "one for each coordinate of a state, or empty"
         )
     return tuple(map(str, labels))
@@ -334,7 +334,7 @@ def circular_observation(problem: Any, sensing_action: int, size: int) -> Sequen
     own = _indices(problem.circular_observations[sensing_action])
     if any(coordinate >= size for coordinate in own):
         raise ProblemError(
-            f"circular_observations[{sensing_action}] of {name_of(problem)} is {own!r:.80}: "
+            f"circular_observations[{sensing_action}] of {name_of(problem)} is {brief(own)}: "
             f"sensing action {sensing_action} shows {size} coordinates, 0 to {size - 1}"
         )
     return own
@@ -368,7 +368,7 @@ def resolution_of(
     # A configuration asks before check_problem has.
     numbers = real_numbers(own)
     if numbers is None:
-        raise ProblemError(f"{attribute} of {name_of(problem)} is {own!r:.80}: must be numbers")
+        raise ProblemError(f"{attribute} of {name_of(problem)} is {brief(own)}: must be numbers")
     if numbers.ndim == 0:
         return own if isinstance(own, (int, float)) else float(numbers)
     if of_states and attribute == "resolution" and problem.state_size != problem.action_size:

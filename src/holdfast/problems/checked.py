@@ -29,7 +29,7 @@ from holdfast.numerics.arrays import (
 )
 from holdfast.numerics.floating_mode import as_caller
 from holdfast.numerics.randomness import Stream
-from holdfast.printable import one_line
+from holdfast.printable import brief
 from holdfast.problems.attributes import has_own, name_of
 
 MAX_OBSERVATION_SIZE = 1024
@@ -262,7 +262,7 @@ def next_stage(problem: Any, estimate: FloatArray, stage: int) -> int:
     # A comparison with NaN is false.
     if not 0 <= value < problem.num_stages:
         raise ProblemError(
-            f"next_stage of {name_of(problem)} is {value!r:.40}: allowed are 0 to "
+            f"next_stage of {name_of(problem)} is {brief(value)}: allowed are 0 to "
             f"{problem.num_stages - 1}"
         )
     return int(value)
@@ -387,11 +387,7 @@ def _states(problem: Any, function: str, shape: tuple[int, ...], *arguments: obj
 
 
 def move_each(
-    problem: Any,
-    states: FloatArray,
-    actions: FloatArray,
-    streams: Sequence[Stream],
-    threads: int,
+    problem: Any, states: FloatArray, actions: FloatArray, streams: Sequence[Stream], threads: int
 ) -> FloatArray:
     """Return b beliefs moved, each by its own action and with its own stream, read-only.
 
@@ -522,7 +518,7 @@ def _returned(problem: Any, function: str, value: object, need: str) -> ProblemE
         masked = ", masked in part," if is_masked(value) else ""
         came = f"{value.dtype}{masked} of shape {value.shape}"
     else:
-        came = f"{type(value).__name__} ({one_line(repr(value)):.40})"
+        came = f"{type(value).__name__} ({brief(value)})"
     return ProblemError(f"{function} of {name_of(problem)} returned {came}: need {need}")
 
 

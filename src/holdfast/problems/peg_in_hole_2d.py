@@ -71,9 +71,7 @@ class PegInHole2D(PegProblem):
     up = "y"
 
     def __init__(
-        self,
-        model: PegInHole2DModel | None = None,
-        state_space_planner: PegPlanner | None = None,
+        self, model: PegInHole2DModel | None = None, state_space_planner: PegPlanner | None = None
     ) -> None:
         model = validated("model", model or PegInHole2DModel())
         planner = validated("state_space_planner", state_space_planner or PegPlanner())

@@ -90,9 +90,7 @@ class PegInHole3D(PegProblem):
     pose: Sequence[str | None] = ("x", "y", "z", "yaw", "pitch", "roll")
 
     def __init__(
-        self,
-        model: PegInHole3DModel | None = None,
-        state_space_planner: PegPlanner | None = None,
+        self, model: PegInHole3DModel | None = None, state_space_planner: PegPlanner | None = None
     ) -> None:
         model = validated("model", model or PegInHole3DModel())
         planner = validated("state_space_planner", state_space_planner or PegPlanner())

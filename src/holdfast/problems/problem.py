@@ -34,12 +34,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, Self, runtime_checkable
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from holdfast.errors import ProblemError
-from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray, real_numbers
+from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray, plain, real_numbers
 from holdfast.numerics.randomness import Stream
+from holdfast.printable import brief
 from holdfast.problems.attributes import know_earlier_names
 
 
@@ -73,7 +75,7 @@ class Scene:
     Raises
     ------
     ProblemError
-        If an argument has another shape.
+        If an argument has another shape, or is no coordinate of a state where one is needed.
 
     Examples
     --------
@@ -95,8 +97,13 @@ class Scene:
         targets: Sequence[tuple[int, int]] = (),
         walls: Sequence[tuple[tuple[int | None, int | None], npt.ArrayLike]] = (),
     ) -> None:
-        self.axes = axes
-        _in_scene("limits", limits, (4,))
+        self.axes: tuple[int, int] = _of_state("axes", axes)
+        low, high = np.split(_in_scene("limits", limits, (4,)), 2)
+        if not (low < high).all() or not np.isfinite(high - low).all():
+            raise ProblemError(
+                f"limits of a Scene is {brief(limits)}: must be finite x_min, y_min, x_max, y_max, "
+                "x_min below x_max and y_min below y_max"
+            )
         self.limits = limits
         self.obstacles = _in_scene("obstacles", obstacles, (None, 4))
         if body is not None:
@@ -104,17 +111,39 @@ class Scene:
             outline = _in_scene("body", body, () if is_radius else (None, 2))
             body = float(outline) if is_radius else outline
         self.body = body
-        self.angle = angle
+        self.angle: int | None = _of_state("angle", angle)
         self.goal = None if goal is None else _in_scene("goal", goal, (2,))
         self.points = None if points is None else _in_scene("points", points, (None, 2))
-        self.targets = [(x, y) for x, y in targets]
-        self.walls = [((x, y), _in_scene("walls", wall, (4,))) for (x, y), wall in walls]
+        self.targets: list[tuple[int, int]] = _of_state("targets", targets)
+        self.walls: list[tuple[tuple[int | None, int | None], FloatArray]] = [
+            (pair, _in_scene("walls", wall, (4,))) for pair, wall in _of_state("walls", walls)
+        ]
+
+
+_PAIRS: Any = list[tuple[int, int]]
+_MOVED: Any = list[tuple[tuple[int | None, int | None], list[float]]]
+_OF_STATE: Mapping[str, tuple[Any, str]] = {
+    "axes": (tuple[int, int], "two coordinates of the state, such as (0, 1)"),
+    "angle": (int | None, "a coordinate of the state, such as 2, or None"),
+    "targets": (_PAIRS, "pairs of coordinates of the state, such as [(2, 3)]"),
+    "walls": (_MOVED, "coordinates that move rectangles, such as [((None, 3), (0, 0, 1, 2))]"),
+}
+
+
+def _of_state(name: str, value: object) -> Any:
+    kind, needed = _OF_STATE[name]
+    try:
+        return msgspec.convert(plain(value), kind)
+    except msgspec.ValidationError:
+        raise ProblemError(f"{name} of a Scene is {brief(value)}: must be {needed}") from None
 
 
 def _in_scene(name: str, value: object, shape: tuple[int | None, ...]) -> FloatArray:
     numbers = real_numbers(value)
+    sizes = ", ".join("any number" if want is None else str(want) for want in shape)
+    need = f"of the shape ({sizes})" if shape else "a single one"
     if numbers is None:
-        raise ProblemError(f"{name} of a Scene is {value!r:.80}: must be numbers")
+        raise ProblemError(f"{name} of a Scene is {brief(value)}: must be numbers, {need}")
     numbers = np.array(numbers, dtype=np.float64)
     if numbers.shape == (0,) and len(shape) == 2:
         return np.empty((0, shape[1] or 0))
@@ -122,9 +151,8 @@ def _in_scene(name: str, value: object, shape: tuple[int | None, ...]) -> FloatA
         want in (None, have) for want, have in zip(shape, numbers.shape, strict=True)
     )
     if not fits or np.isnan(numbers).any():
-        need = ", ".join("any number" if want is None else str(want) for want in shape)
         raise ProblemError(
-            f"{name} of a Scene has the shape {numbers.shape}: must be ({need}), without NaN"
+            f"{name} of a Scene has the shape {numbers.shape}: must be ({sizes}), without NaN"
         )
     return numbers
 
@@ -482,7 +510,7 @@ class ProblemBase:
             return cls(**model, **state_space_planner)
         except TypeError as error:
             raise ProblemError(
-                f"{cls.__name__} cannot be built from its settings: {error}"
+                f"{cls.__name__} cannot be built from its settings (the keys of model): {error}"
                 f"{_meant(cls, [*model, *state_space_planner])}"
             ) from error
 

@@ -112,10 +112,7 @@ class RigidBodyProblem(KeepsReadOnly, ProblemBase):
         )
 
     def __init__(
-        self,
-        model: Any,
-        state_space_planner: Any,
-        world: DiscWorld | RectangleWorld | BoxWorld,
+        self, model: Any, state_space_planner: Any, world: DiscWorld | RectangleWorld | BoxWorld
     ) -> None:
         self.model = model
         self.state_space_planner = state_space_planner

@@ -21,13 +21,7 @@ from collections.abc import Iterator
 from holdfast.protocol.messages import Request
 from holdfast.protocol.service_jobs import Job
 from holdfast.protocol.service_limits import ServiceLimits
-from holdfast.protocol.service_sessions import (
-    PREFETCHED,
-    REQUESTED,
-    Owner,
-    PendingTask,
-    Session,
-)
+from holdfast.protocol.service_sessions import PREFETCHED, REQUESTED, Owner, PendingTask, Session
 
 _TOGETHER_S = 0.004
 """Expected time of the short tasks that a worker has at a time: nothing else runs meanwhile."""

@@ -225,9 +225,7 @@ class Robot:
     # -- what happens ----------------------------------------------------------------------------
 
     def handle(
-        self,
-        event: TransportEvent | EnvironmentEvent | OwnAnswer | RecoveryExited,
-        now: float,
+        self, event: TransportEvent | EnvironmentEvent | OwnAnswer | RecoveryExited, now: float
     ) -> list[RobotEffect]:
         """Handle an event."""
         if isinstance(event, Sensed | NoReading | Acted | EnvironmentFailed):

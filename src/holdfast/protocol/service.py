@@ -490,10 +490,7 @@ class Service:
         for record in self._calls.detach(task):
             if outcome.failure is None:
                 self._calls.send_need_state(
-                    record.call,
-                    record.number,
-                    differs=outcome.differs,
-                    diverged=outcome.diverged,
+                    record.call, record.number, differs=outcome.differs, diverged=outcome.diverged
                 )
             else:
                 self._calls.send_refused(record.call, record.number, *outcome.failure)
@@ -551,13 +548,7 @@ class Service:
             self._calls.send_sensing(record.call, record.number, digest, answer)
 
     def _reject_busy(
-        self,
-        call: int,
-        number: int,
-        key: SessionKey,
-        lane: int,
-        now: float,
-        least_ms: float = 1.0,
+        self, call: int, number: int, key: SessionKey, lane: int, now: float, least_ms: float = 1.0
     ) -> None:
         owner, session = key
         wait_ms = max(least_ms, 1e3 * self._queue[lane].wait_s(now, owner))

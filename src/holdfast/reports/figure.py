@@ -98,12 +98,13 @@ STYLE: Any = {
     "legend.frameon": False,
     "legend.fontsize": 8.5,
     "mathtext.default": "regular",
+    "svg.hashsalt": "holdfast",
 }
 
 
 @in_own_mode
 def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) -> None:
-    """Draw a trial and write the picture as PNG.
+    """Draw a trial and write the picture; the name of the file says whether as PNG, PDF or SVG.
 
     Raises OutputError if it cannot be written.
     """
@@ -141,7 +142,10 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
         panels[-1].set_xlabel("step")
         panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
         picture = io.BytesIO()
-        figure.savefig(picture, format="png", dpi=_DOTS_PER_INCH)
+        kind = path.suffix.lower().removeprefix(".")
+        # The same trial gives the same file, whenever it is drawn.
+        undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(kind)
+        figure.savefig(picture, format=kind, dpi=_DOTS_PER_INCH, metadata=undated)
     write_atomically(path, picture.getvalue())
 
 

@@ -28,6 +28,9 @@ from holdfast.printable import printable
 MAX_BYTES = 3_000_000
 """Largest size of a page; the library takes 0.9 MB of it."""
 
+GENERATOR = b'<meta name="generator" content="holdfast report">'
+"""Stands near the beginning of each page, so that a page can be told from somebody's file."""
+
 _MAX_ROWS = 200
 """Rows of a table that are shown."""
 

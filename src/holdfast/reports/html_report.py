@@ -18,7 +18,11 @@ from holdfast.config.user_code import describe_problem_error
 from holdfast.errors import HoldfastError, OutputError, UntrustedCodeError
 from holdfast.journal.fingerprint import read_earlier
 from holdfast.journal.journal_reader import JournalReader
-from holdfast.journal.run_directory import TIMINGS_NAME, VERIFICATION_NAME
+from holdfast.journal.run_directory import (
+    TIMINGS_NAME,
+    VERIFICATION_NAME,
+    recorded_configuration,
+)
 from holdfast.journal.timings import TimingRow, count_answers, count_verified
 from holdfast.planning.outcome import COUNTS, TrialResult
 from holdfast.printable import one_line
@@ -116,7 +120,7 @@ def run_page(
         page.paragraph(f"Note: {one_line(note)}", muted=True)
     page.section("Settings")
     page.code(meta.get("configuration", ""), summary="All settings, with defaults")
-    _add_origin(page, meta)
+    _add_origin(page, meta, simulated=outcomes.simulated)
     return page.html(), notes
 
 
@@ -277,7 +281,7 @@ def _add_trial(page: HtmlPage, chart: TrialChart, configuration: Configuration) 
     )
 
 
-def _add_origin(page: HtmlPage, meta: Mapping[str, str]) -> None:
+def _add_origin(page: HtmlPage, meta: Mapping[str, str], *, simulated: bool) -> None:
     page.section("Machine and versions")
     made = meta.get("holdfast_core") or meta.get("holdfast_version") or "of an unknown version"
     rows = [("run by holdfast", made), ("run on", meta.get("machine", "not recorded"))]
@@ -287,12 +291,29 @@ def _add_origin(page: HtmlPage, meta: Mapping[str, str]) -> None:
     rows.append(("report by holdfast", f"{core_version()}, Python {platform.python_version()}"))
     page.table([], rows)
     page.section("Repeat it")
+    modules, options = _elsewhere(meta.get("configuration", ""))
+    beside = f", and beside it {' and '.join(modules)}" if modules else ""
     page.paragraph(
-        "With that version of holdfast, save the settings as config.yaml (a problem of somebody's "
-        "own needs its module, too; services that are named there must run), then:"
+        f"With that version of holdfast, save the settings as config.yaml{beside}; then:"
     )
-    page.code("holdfast run config.yaml --out again\nholdfast compare RUN again")
+    page.code(f"holdfast run config.yaml{options} --out again\nholdfast compare RUN again")
     page.paragraph("The decisions are the same, bit for bit, where compare says so.")
+    if not simulated:
+        page.paragraph("This acts in the robot's own world again, which may show other things.")
+
+
+def _elsewhere(configuration: str) -> tuple[list[str], str]:
+    """Return the modules that a run needs on another machine, and the options that it needs there.
+
+    Its modules lie elsewhere there, and its services are not there; the robot decides the same.
+    """
+    told = recorded_configuration(configuration)
+    acting = (told.get("environment") or {}).get("object")
+    named = {" --problem-directory .": told["problem"], " --set environment.directory=.": acting}
+    own = {option: name for option, name in named.items() if ":" in str(name)}
+    modules = {f"the module {one_line(name.partition(':')[0]):.100}" for name in own.values()}
+    has_services = (told.get("offload") or {}).get("services")
+    return sorted(modules), "".join([*own, " --set 'offload.services=[]'" * bool(has_services)])
 
 
 def comparison_page(runs: Sequence[Path]) -> tuple[bytes, list[str]]:

@@ -26,6 +26,7 @@ from holdfast.errors import ProblemError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.circular import differences
 from holdfast.planning.belief import Belief, estimate
+from holdfast.printable import brief
 from holdfast.problems.attributes import circular_states, sequence_of
 
 POSE_COORDINATES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -100,7 +101,7 @@ def pose_layout(problem: Any) -> PoseLayout | None:
     name = getattr(problem, "name", "") or type(problem).__name__
     if words is None:
         raise ProblemError(
-            f"pose of {name} is {given!r:.80}: must be a sequence with one word for each coordinate"
+            f"pose of {name} is {brief(given)}: must be a sequence with a word for each coordinate"
             ' of the state, such as ("x", "y", "yaw")'
         )
     if len(words) > problem.state_size:
@@ -113,7 +114,7 @@ def pose_layout(problem: Any) -> PoseLayout | None:
             continue
         if word not in POSE_COORDINATES:
             raise ProblemError(
-                f"pose[{index}] of {name} is {word!r:.80}: allowed are "
+                f"pose[{index}] of {name} is {brief(word)}: allowed are "
                 f"{', '.join(POSE_COORDINATES)} and None"
             )
         if word in indices:
@@ -123,7 +124,7 @@ def pose_layout(problem: Any) -> PoseLayout | None:
         return None
     up = getattr(problem, "up", "z")
     if not isinstance(up, str) or up not in _UPRIGHT:
-        raise ProblemError(f"up of {name} is {up!r:.80}: allowed are y and z")
+        raise ProblemError(f"up of {name} is {brief(up)}: allowed are y and z")
     return PoseLayout(
         tuple(indices.get(word) for word in POSE_COORDINATES),
         _UPRIGHT[up],

@@ -22,14 +22,7 @@ from holdfast.numerics.arrays import FloatArray, IntArray, whole
 from holdfast.planning.belief import Belief
 from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
 from holdfast.planning.planner import Planner
-from holdfast.reports.facts import (
-    EventFact,
-    LateFact,
-    SensingFact,
-    TaskFact,
-    TrialBeginFact,
-    TrialEndFact,
-)
+from holdfast.reports import facts
 from holdfast.reports.replay import RecordedRun
 from holdfast.robot.trial import SensingStep
 
@@ -172,31 +165,31 @@ class _Collector:
         self._no_entropies = np.full(num_choices, np.nan)
         self._sensing: list[SensingStep] = []
         self._late: dict[int, FloatArray] = {}
-        self._tasks: list[TaskFact] = []
-        self._end: TrialEndFact | None = None
+        self._tasks: list[facts.TaskFact] = []
+        self._end: facts.TrialEndFact | None = None
 
-    def trial_begins(self, fact: TrialBeginFact) -> None:
+    def trial_begins(self, fact: facts.TrialBeginFact) -> None:
         """Forget the trial before."""
         del fact
         self._sensing, self._tasks, self._end, self._late = [], [], None, {}
 
-    def sensed(self, fact: SensingFact) -> None:
+    def sensed(self, fact: facts.SensingFact) -> None:
         """Keep a sensing action."""
         self._sensing.append(fact.step)
 
-    def acted(self, fact: TaskFact) -> None:
+    def acted(self, fact: facts.TaskFact) -> None:
         """Keep a task action."""
         self._tasks.append(fact)
 
-    def observed_late(self, fact: LateFact) -> None:
+    def observed_late(self, fact: facts.LateFact) -> None:
         """Keep a late observation."""
         self._late[fact.step.late.taken] = fact.step.late.numbers()
 
-    def trial_ends(self, fact: TrialEndFact) -> None:
+    def trial_ends(self, fact: facts.TrialEndFact) -> None:
         """Keep the end."""
         self._end = fact
 
-    def happened(self, fact: EventFact) -> None:
+    def happened(self, fact: facts.EventFact) -> None:
         """Leave events out."""
 
     def collected(self, trial: int, action_size: int) -> TrialArrays:
@@ -212,7 +205,7 @@ class _Collector:
         rewards = [np.nan if step.reward is None else step.reward for step in acted]
         beliefs = [*(step.state.belief for step in acted), end.belief]
         estimates = [*(step.task_info.estimate for step in acted), end.estimate]
-        ends: list[TaskFact | TrialEndFact] = [*tasks, end]
+        ends: list[facts.TaskFact | facts.TrialEndFact] = [*tasks, end]
         true_states = [each.true_state for each in ends if each.true_state is not None]
         return TrialArrays(
             trial,

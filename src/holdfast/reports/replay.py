@@ -44,7 +44,7 @@ from holdfast.reports.recorder import true_state
 from holdfast.reports.step_times import StepClock, TrialTimes, read_times, trial_ends
 from holdfast.robot.environment import Environment
 from holdfast.robot.recomputing import ComparedTrial, RecordedTrials
-from holdfast.robot.trial import LateStep, SensingStep, TaskStep
+from holdfast.robot.trial import NULL_OBSERVER, LateStep, SensingStep, TaskStep, TrialObserver
 
 
 class RecordedRun:
@@ -70,7 +70,11 @@ class RecordedRun:
         times.
     clock_notes : tuple of str
         How the robot's wall clock was set while it ran.
+    observer : TrialObserver
+        Gets the steps of what is replayed, beside the facts.
     """
+
+    observer: TrialObserver = NULL_OBSERVER
 
     def __init__(
         self, run: Path, purpose: str = "export", *, problem_directory: Path | None = None
@@ -136,7 +140,7 @@ class RecordedRun:
     def _replay(
         self, recorded: TrialResult | UnfinishedTrial, output: _Output, clock: StepClock
     ) -> int:
-        facts = _Facts(recorded, output, self._recorded.planner)
+        facts = _Facts(recorded, output, self._recorded.planner, self.observer)
         facts.times = self._times(facts, clock)
         try:
             if not self._recorded.run(recorded, facts):
@@ -179,9 +183,13 @@ class _Facts(ComparedTrial):
     times: TrialTimes
 
     def __init__(
-        self, recorded: TrialResult | UnfinishedTrial, output: _Output, planner: Planner
+        self,
+        recorded: TrialResult | UnfinishedTrial,
+        output: _Output,
+        planner: Planner,
+        observer: TrialObserver,
     ) -> None:
-        super().__init__(recorded)
+        super().__init__(recorded, observer=observer)
         self._planner = planner
         self._output = output
         self._steps = 0
@@ -190,6 +198,7 @@ class _Facts(ComparedTrial):
         self._true_state: FloatArray | None = None
 
     def trial_began(self, environment: Environment, state: PlanningState) -> None:
+        super().trial_began(environment, state)
         self._state = state
         self._true_state = true_state(environment)
         begin = TrialBeginFact(self.trial, self.times.at(0, 0))
@@ -300,11 +309,11 @@ def _configuration(
 def _what_to_say(problem: str, recorded: object, path: Path, purpose: str) -> str:
     """Return how a caller says that a run's own problem may run."""
     # On one line each, for these are somebody's words as well.
-    directory = one_line(recorded) if isinstance(recorded, str) else "DIR"
+    directory = one_line(recorded) if isinstance(recorded, str) and len(recorded) < 4096 else "DIR"
     if purpose == "open":
-        how = f"open_run(..., problem_directory={directory!r:.200})"
+        how = f"open_run(..., problem_directory={directory!r})"
     else:
-        how = f"--problem-directory {shlex.quote(f'{directory:.200}')}"
+        how = f"--problem-directory {shlex.quote(directory)}"
     told = "" if directory == "DIR" else ", where it lay when it was run"
     return (
         f"{path}: its problem is {one_line(problem):.100}, and the code that a record names is "

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from holdfast.errors import HoldfastError, InvalidValueError, how_to_install
-from holdfast.printable import csv_rows
+from holdfast.printable import brief, csv_rows
 from holdfast.runtime.files import write_atomically
 from holdfast.validation import as_path
 
@@ -115,7 +115,7 @@ class Table:
         for each in columns:
             if not isinstance(each, str) or each not in names[1:]:
                 allowed = ", ".join(names[1:])
-                raise InvalidValueError(f"columns has {each!r:.80}; allowed are {allowed}")
+                raise InvalidValueError(f"columns has {brief(each)}; allowed are {allowed}")
         kept = [0, *map(names.index, columns)]
         return [tuple(row[at] for at in kept) for row in shown]
 

@@ -16,18 +16,13 @@ from typing import Protocol, Self, runtime_checkable
 import numpy as np
 
 from holdfast.errors import EnvironmentFailedError, InvalidValueError
-from holdfast.numerics.arrays import (
-    NOTHING_ELSE,
-    FloatArray,
-    KeepsReadOnly,
-    floats,
-    real_numbers,
-)
+from holdfast.numerics.arrays import NOTHING_ELSE, FloatArray, KeepsReadOnly, floats, real_numbers
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.numerics.randomness import Purpose, Stream, seed_and_trial, stream
 from holdfast.planning.inputs import Late, Moved, Sensed, encode_floats
 from holdfast.planning.outcome import Done, Ending, MoveResult, ending_of
 from holdfast.planning.settings import EnvironmentSettings
+from holdfast.printable import brief
 from holdfast.problems import checked
 from holdfast.problems.attributes import check_sizes, has_general_observations, sensing_action_of
 from holdfast.problems.problem import Problem, ProblemBase
@@ -395,7 +390,7 @@ class CheckedEnvironment:
     def _unusable(self, value: object, need: str) -> EnvironmentFailedError:
         came = f"an array of shape {value.shape}: " if isinstance(value, np.ndarray) else ""
         return EnvironmentFailedError(
-            f"{self.called} returned {came}{value!r:.80}; it must return {need}"
+            f"{self.called} returned {came}{brief(value)}; it must return {need}"
         )
 
 

@@ -44,7 +44,7 @@ from holdfast.numerics.arrays import (
 )
 from holdfast.numerics.randomness import Purpose, seed_and_trial, stream
 from holdfast.planning.outcome import Done, Ending, MoveResult
-from holdfast.printable import one_line
+from holdfast.printable import brief
 from holdfast.problems.problem import Problem
 
 if TYPE_CHECKING:
@@ -174,7 +174,7 @@ class GymnasiumEnvironment:
         count = None if callable(self._sensing) else len(self._sensing)
         if chosen is None or chosen < 0 or (count is not None and chosen >= count):
             raise InvalidValueError(
-                f"sensing action {sensing_action!r:.80}: sensing of {self._name} has 0 to "
+                f"sensing action {brief(sensing_action)}: sensing of {self._name} has 0 to "
                 f"{'...' if count is None else count - 1}"
             )
         sensing_action = chosen
@@ -194,7 +194,7 @@ class GymnasiumEnvironment:
         seen, reward, terminated, truncated, self.info = self.environment.step(action)
         if (earned := real_number(reward)) is None:
             raise EnvironmentFailedError(
-                f"the reward of {self._name} is {reward!r:.80}; it must be a number"
+                f"the reward of {self._name} is {brief(reward)}; it must be a number"
             )
         self._seen = copy.deepcopy(seen)
         self._steps += 1
@@ -273,7 +273,7 @@ class GymnasiumEnvironment:
             action = self._action(self.environment, task_action.copy())
             if not space.contains(action):
                 raise EnvironmentFailedError(
-                    f"action of {self._name} returned {action!r:.80}, which is not in {space}"
+                    f"action of {self._name} returned {brief(action)}, which is not in {space}"
                 )
             return action
         limits = _limits(space)
@@ -312,7 +312,7 @@ class GymnasiumEnvironment:
             key = "sensing"
             if not isinstance(sensing, Sequence) or not sensing:
                 raise ConfigurationError(
-                    f"environment.arguments.sensing is {sensing!r:.80}; it must have a list of "
+                    f"environment.arguments.sensing is {brief(sensing)}; it must have a list of "
                     "coordinates for each sensing action, or be a function"
                 )
             readers = [self._indices(each, f"{key}[{n}]") for n, each in enumerate(sensing)]
@@ -353,7 +353,7 @@ class GymnasiumEnvironment:
             or not all(integer(each) is not None and 0 <= each < size for each in given)
         ):
             raise ConfigurationError(
-                f"environment.arguments.{key} is {given!r:.80}; it must be a list of whole numbers "
+                f"environment.arguments.{key} is {brief(given)}; it must be a list of numbers "
                 f"from 0 to {size - 1}, the coordinates of an observation of {self._name}"
             )
         return list(given)
@@ -370,8 +370,7 @@ class GymnasiumEnvironment:
         numbers = real_numbers(shown)
         if numbers is None:
             raise EnvironmentFailedError(
-                f"{key} of {self._name} shows {one_line(repr(shown)):.80}; it must be an "
-                "array of numbers"
+                f"{key} of {self._name} shows {brief(shown)}; it must be an array of numbers"
             )
         values = np.array(numbers, dtype=np.float64).reshape(-1)
         if deviations.size not in (1, values.size):
@@ -398,7 +397,7 @@ def _made(
         return env_id
     if not isinstance(env_id, str):
         raise ConfigurationError(
-            f"environment.arguments.env_id is {env_id!r:.80}; it must be the id of an environment "
+            f"environment.arguments.env_id is {brief(env_id)}; it must be the id of an environment "
             "of gymnasium"
         )
     try:
@@ -413,7 +412,7 @@ def _function(given: Any, key: str) -> Callable[..., Any]:
             found: Callable[..., Any] = given
             return found
         raise ConfigurationError(
-            f"environment.arguments.{key} is {given!r:.80}; it must be a function, module:function"
+            f"environment.arguments.{key} is {brief(given)}; it must be a function, module:function"
         )
     module, _, name = given.partition(":")
     try:
@@ -432,7 +431,7 @@ def _deviations(given: Any, key: str) -> FloatArray:
     array = np.empty(0) if numbers is None else np.array(numbers, dtype=np.float64).reshape(-1)
     if not array.size or not (np.isfinite(array) & (array >= 0.0)).all():
         raise ConfigurationError(
-            f"environment.arguments.{key} is {given!r:.80}; it must be a standard deviation, a "
+            f"environment.arguments.{key} is {brief(given)}; it must be a standard deviation, a "
             "number >= 0, or one for each coordinate"
         )
     return array

@@ -35,15 +35,8 @@ from holdfast.planning.outcome import Ending, MoveResult, ending_of
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import Method, PlanningSettings, SimulatorSettings
 from holdfast.planning.tracking import Trial
-from holdfast.problems import checked
-from holdfast.problems.attributes import (
-    check_problem,
-    choice_labels,
-    circular_actions,
-    circular_states,
-    sensing_costs,
-    state_labels,
-)
+from holdfast.printable import brief
+from holdfast.problems import attributes, checked
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import SimulatedEnvironment
 
@@ -149,10 +142,10 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         built, planning, steps = _built(problem, model, settings)
         planning = _changed(planning, sensing_interval, sensing_is_optional)
         self.planner = Planner(built, planning, particles=particles)
-        check_problem(built)
+        attributes.check_problem(built)
         self.problem = built
         self.max_steps = whole("max_steps", steps if max_steps is None else max_steps, 1)
-        self._costs = sensing_costs(built, optional=True)
+        self._costs = attributes.sensing_costs(built, optional=True)
         self._minus_steps = reward == "steps"
         self._with_particles = observation == "particles"
         self._planners: dict[Method, Planner] = {}
@@ -165,8 +158,8 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         self._sensing_steps = 0
 
         self.state_low, self.state_high, self._action_size = _ranges(built, self.max_steps)
-        self._circular = list(circular_states(built))
-        self._circular_actions = circular_actions(built)
+        self._circular = list(attributes.circular_states(built))
+        self._circular_actions = attributes.circular_actions(built)
         self.observation_labels = self._labels()
         self.action_space = spaces.Discrete(self.planner.num_choices)
         summary = spaces.Box(-1.0, 1.0, (len(self.observation_labels),), np.float32)
@@ -217,7 +210,7 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         choice = integer(action)
         if choice is None or not 0 <= choice < self.planner.num_choices:
             raise InvalidValueError(
-                f"action {action!r:.80}: {self.problem.name} has 0 to "
+                f"action {brief(action)}: {self.problem.name} has 0 to "
                 f"{self.planner.num_choices - 1} (the last is not to sense if sensing_is_optional)"
             )
         total = 0.0
@@ -286,7 +279,7 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
 
     def _labels(self) -> list[str]:
         problem = self.problem
-        states = state_labels(problem) or range(problem.state_size)
+        states = attributes.state_labels(problem) or range(problem.state_size)
         labels = []
         for index, name in enumerate(states):
             kinds = ("sine", "cosine") if index in self._circular else ("estimate",)
@@ -297,7 +290,8 @@ class ProblemEnv(gymnasium.Env[Any, Any]):
         if problem.num_stages > 1:
             labels += [f"stage {stage}" for stage in range(problem.num_stages)]
         return labels + [
-            f"since {name}" for name in choice_labels(problem)[: self.planner.num_choices]
+            f"since {name}"
+            for name in attributes.choice_labels(problem)[: self.planner.num_choices]
         ]
 
     def _observation(self) -> Any:
@@ -352,7 +346,7 @@ def _built(
     is_path = isinstance(problem, str) and problem.endswith((".yaml", ".yml"))
     if model is not None and (is_path or not isinstance(problem, str)):
         raise InvalidValueError(
-            f"model is {dict(model)!r:.80}; it goes with the name of a problem alone"
+            f"model is {brief(dict(model))}; it goes with the name of a problem alone"
         )
     if isinstance(problem, str) and is_path:
         from holdfast.config.loader import load
@@ -400,7 +394,7 @@ def _ranges(problem: Problem, max_steps: int) -> tuple[FloatArray, FloatArray, F
             break
     room = np.where(high > low, _MARGIN * (high - low), 1.0)
     low, high = low - room, high + room
-    angles = list(circular_states(problem))
+    angles = list(attributes.circular_states(problem))
     low[angles], high[angles] = -np.pi, np.pi
     return low, high, np.where(largest > 0.0, largest, 1.0)
 
@@ -419,4 +413,4 @@ def _logarithmic(ratios: FloatArray) -> list[float]:
 
 def _require_one_of(key: str, value: object, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
-        raise InvalidValueError(f"{key} is {value!r:.80}; allowed: {', '.join(allowed)}")
+        raise InvalidValueError(f"{key} is {brief(value)}; allowed: {', '.join(allowed)}")

@@ -16,18 +16,12 @@ from typing import NamedTuple
 
 from holdfast.errors import HeldError, InvalidValueError
 from holdfast.numerics.arrays import FloatArray, whole
+from holdfast.planning import settings
 from holdfast.planning.belief import ObservationInfo
 from holdfast.planning.inputs import Late, Moved, Reinitialised, Sensed
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState, TaskInfo
 from holdfast.planning.sensing import SensingInfo
-from holdfast.planning.settings import (
-    EnvironmentSettings,
-    LostSettings,
-    OnLost,
-    SimulatorSettings,
-    check_settings,
-)
 from holdfast.planning.tracking import Trial
 from holdfast.robot.environment import (
     CheckedEnvironment,
@@ -111,7 +105,7 @@ class TrialObserver:
 
 NULL_OBSERVER = TrialObserver()
 
-_LOST_BY_DEFAULT = LostSettings()
+_LOST_BY_DEFAULT = settings.LostSettings()
 
 
 def run_trial(
@@ -119,11 +113,11 @@ def run_trial(
     seed: int = 0,
     trial: int = 0,
     *,
-    max_steps: int = SimulatorSettings().max_steps,
+    max_steps: int = settings.SimulatorSettings().max_steps,
     environment: Environment | None = None,
     observer: TrialObserver = NULL_OBSERVER,
-    lost: LostSettings = _LOST_BY_DEFAULT,
-    max_missing_in_a_row: int = EnvironmentSettings().max_missing_in_a_row,
+    lost: settings.LostSettings = _LOST_BY_DEFAULT,
+    max_missing_in_a_row: int = settings.EnvironmentSettings().max_missing_in_a_row,
     reinitialised_after: Collection[int] | None = None,
 ) -> TrialResult:
     """Run one trial until it is done, has failed, or has had ``max_steps``.
@@ -164,9 +158,9 @@ def run_trial(
     else:
         _require_new(environment)
     require_methods(environment, type(environment).__name__)
-    lost = check_settings(lost, LostSettings, "lost")
-    missed = EnvironmentSettings(max_missing_in_a_row=max_missing_in_a_row)
-    missed = check_settings(missed, EnvironmentSettings, "environment")
+    lost = settings.check_settings(lost, settings.LostSettings, "lost")
+    missed = settings.EnvironmentSettings(max_missing_in_a_row=max_missing_in_a_row)
+    missed = settings.check_settings(missed, settings.EnvironmentSettings, "environment")
     track = Trial(planner, seed, trial, lost.false_alarm_rate)
     name, most = type(environment).__name__, missed.max_missing_in_a_row
     world = CheckedEnvironment(planner.problem, name, most, environment)
@@ -256,7 +250,7 @@ def _sense(track: Trial, world: CheckedEnvironment, observer: TrialObserver) -> 
 
 def _act_if_lost(
     track: Trial,
-    on_lost: OnLost,
+    on_lost: settings.OnLost,
     recorded: Collection[int] | None,
     observer: TrialObserver,
 ) -> None:

@@ -49,6 +49,7 @@ from holdfast.numerics.arrays import integer
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, PlanningSettings
+from holdfast.printable import brief
 from holdfast.problems.problem import Problem
 from holdfast.robot.trial import NULL_OBSERVER, TrialObserver, run_trial
 from holdfast.runtime.command_line import MAX_JOBS
@@ -136,7 +137,7 @@ class TrialPool:
         cluster: RayCluster | None = None,
     ) -> None:
         if integer(jobs) is None or not 1 <= jobs <= MAX_JOBS:
-            raise InvalidValueError(f"jobs is {jobs!r:.80}; it must be from 1 to {MAX_JOBS}")
+            raise InvalidValueError(f"jobs is {brief(jobs)}; it must be from 1 to {MAX_JOBS}")
         # A worker of multiprocessing's pools, which is daemonic, may start no processes.
         alone = multiprocessing.current_process().daemon
         self._jobs = 1 if alone else jobs

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, NoReturn, Self
 
 from holdfast.errors import OptionError
+from holdfast.printable import brief
 
 MAX_JOBS = 1024
 """Largest number of worker processes that a command can be asked for (``--jobs``)."""
@@ -149,6 +150,43 @@ def jobs_option(more: str = " Changes time only.") -> Any:
     )
 
 
+def set_option(example: str, *, instead_of: str = "the file's") -> Any:
+    """Declare the ``--set`` of a command that reads a configuration."""
+    return option(
+        "--set",
+        metavar="SECTION.KEY=VALUE",
+        many=True,
+        help=f"A value instead of {instead_of}, as YAML: {example}.",
+    )
+
+
+def problem_option() -> Any:
+    """Declare the ``--problem`` of a command that reads a configuration."""
+    return option(
+        metavar="NAME", help="Problem instead of the file's: a registered name or module:Class."
+    )
+
+
+def module_option() -> Any:
+    """Declare the ``--problem-directory`` of a command that reads a configuration."""
+    return option(
+        metavar="DIR",
+        read=location,
+        key="problem_directory",
+        help="Where the problem's module lies, instead of where the file says.",
+    )
+
+
+def out_option(default: str) -> Any:
+    """Declare the ``--out`` of a command that writes a directory."""
+    return option(
+        "-o",
+        metavar="DIR",
+        read=location,
+        help=f"Directory for the results (default: runs/{default}, numbered if taken).",
+    )
+
+
 def _with_long(names: tuple[str, ...]) -> tuple[str, ...]:
     """Return the names with room for the attribute's, unless one of them is long."""
     return names if names and names[0].startswith("--") else ("", *names)
@@ -213,12 +251,12 @@ class Options:
             word = unknown[0].partition("=")[0]
             if not word.startswith("-"):
                 word = word.removeprefix(_AFTER_DASHES)
-                raise OptionError(f"{word!r:.80} is one argument too many")
+                raise OptionError(f"{brief(word)} is one argument too many")
             from holdfast.validation import close_match
 
             names = [name for each in cls.table().values() for name in each.names]
             hint = close_match(word, names)
-            raise OptionError(f"{word!r:.80} is no option of {program}{hint}")
+            raise OptionError(f"{brief(word)} is no option of {program}{hint}")
         table = cls.table()
         values = {
             name: tuple(value) if table[name].many else value for name, value in vars(found).items()
@@ -350,7 +388,7 @@ def _complaint(error: argparse.ArgumentError, program: str, arguments: Sequence[
 
 def bad_value(text: str, allowed: str) -> argparse.ArgumentTypeError:
     """Return the error of a value; the parser puts the option's name before it."""
-    return argparse.ArgumentTypeError(f"is {text!r:.80}; allowed are {allowed}")
+    return argparse.ArgumentTypeError(f"is {brief(text)}; allowed are {allowed}")
 
 
 def whole_number(least: int, most: int) -> Callable[[str], int]:

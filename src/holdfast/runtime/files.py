@@ -27,6 +27,7 @@ _started_in: Path | None = None
 
 _UNFINISHED = re.compile(r"\..+\.\d+\.tmp")
 _MAX_LINE = 1 << 20
+_MARKED = 1000  # bytes in which a file says that holdfast wrote it
 
 
 class NewFile(NamedTuple):
@@ -177,10 +178,7 @@ def replace_file(path: Path, content: bytes, mode: int, *, like: Path | None = N
 
 def remove_unfinished_of(directory: Path) -> None:
     """Remove what killed writers left of a directory and in it, where no other process writes."""
-    for left in (
-        *directory.parent.glob(f".{directory.name}.*.tmp"),
-        *directory.glob(".*.tmp"),
-    ):
+    for left in (*directory.parent.glob(f".{directory.name}.*.tmp"), *directory.glob(".*.tmp")):
         if not _UNFINISHED.fullmatch(left.name):
             continue
         if left.is_dir():
@@ -190,17 +188,23 @@ def remove_unfinished_of(directory: Path) -> None:
                 left.unlink()
 
 
-def require_free(path: Path, option: str, *, directory: bool) -> None:
+def require_free(path: Path, option: str, *, directory: bool, ours: bytes = b"") -> None:
     """Check that the file or directory of an option can be created.
 
-    The path is free, or an empty directory where one is wanted, and its parent exists.
+    The path is free, or an empty directory where one is wanted, and its parent exists. A file that
+    begins with lines that have ``ours`` may be there: holdfast wrote it, and may replace it.
     """
     with _refusals(path, "made"):
         if directory and path.is_dir():
             _require_empty(path, option)
         elif path.is_symlink() or path.exists():
+            if ours and not path.is_symlink() and path.is_file():
+                with path.open("rb") as file:
+                    if ours in file.read(_MARKED):
+                        return
+            what = "exists already, and holdfast did not write it" if ours else "exists already"
             raise OutputError(
-                f"{shown_path(path)}: exists already; remove it, or choose another ({option})"
+                f"{shown_path(path)}: {what}; remove it, or choose another ({option})"
             )
         elif not path.parent.is_dir():
             raise OutputError(

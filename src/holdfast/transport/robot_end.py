@@ -14,13 +14,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import count
 
-from holdfast.errors import (
-    DEFECT,
-    FrameError,
-    InvalidValueError,
-    TransportError,
-    defect_fields,
-)
+from holdfast.errors import DEFECT, FrameError, InvalidValueError, TransportError, defect_fields
 from holdfast.protocol.robot_events import TransportEvent
 from holdfast.transport.calls import CallTable, too_large
 from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
@@ -215,10 +209,7 @@ class _ServiceLinks(LinkOwner):
     def start(self) -> None:
         if self._endpoint is not None:
             self._dialer = Dialer(
-                self._endpoint,
-                self._make_link,
-                self._all_failed,
-                self._robot.identity,
+                self._endpoint, self._make_link, self._all_failed, self._robot.identity
             )
             self._dialer.start()
 

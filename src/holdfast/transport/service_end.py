@@ -39,12 +39,7 @@ from holdfast.transport.frames import (
 )
 from holdfast.transport.link_settings import LinkSettings
 from holdfast.transport.links import Link, LinkOwner
-from holdfast.transport.listener import (
-    MAX_SILENT,
-    MAX_WAITING,
-    Listener,
-    connection_to_drop,
-)
+from holdfast.transport.listener import MAX_SILENT, MAX_WAITING, Listener, connection_to_drop
 from holdfast.transport.schemes import link_maker
 
 if TYPE_CHECKING:

@@ -19,6 +19,7 @@ from holdfast.errors import InvalidValueError
 from holdfast.numerics.arrays import real_number, whole
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.settings import PlanningSettings, SimulatorSettings, check_settings
+from holdfast.printable import brief
 from holdfast.problems import attributes, checked
 from holdfast.runtime.command_line import MAX_TRIALS
 from holdfast.tuning.calibration_check import check_likelihoods
@@ -75,7 +76,7 @@ def check_problem(
     """
     if isinstance(problem, str | os.PathLike):
         raise InvalidValueError(
-            f"problem is {str(problem)!r:.80}: check_problem takes an object; make_problem(NAME) "
+            f"problem is {brief(str(problem))}: check_problem takes an object; make_problem(NAME) "
             "and load_configuration(FILE).problem return one, holdfast check takes a file"
         )
     as_function("on_check", on_check)
@@ -86,7 +87,7 @@ def check_problem(
     budget = real_number(budget_s)
     if budget is None or not 0.0 < budget <= 86_400.0:
         raise InvalidValueError(
-            f"budget_s is {budget_s!r:.80}; allowed are numbers above 0 to 86400"
+            f"budget_s is {brief(budget_s)}; allowed are numbers above 0 to 86400"
         )
     inspection = Inspection(problem, settings, max_steps, seed, budget)
     inspection.trials = whole("trials", trials, 0, MAX_TRIALS)

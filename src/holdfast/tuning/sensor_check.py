@@ -17,6 +17,7 @@ from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray
 from holdfast.numerics.circular import differences
 from holdfast.planning.belief import update
 from holdfast.planning.planner import PlanningState
+from holdfast.planning.policy_path import nats_of_halving
 from holdfast.planning.settings import UNINFORMED_METHODS
 from holdfast.problems import checked
 from holdfast.problems.attributes import (
@@ -91,8 +92,11 @@ def _check_prices(inspection: Inspection, costs: FloatArray) -> None:
         return
     seen = f"sensing has prices ({_written(costs)}), but {selector.method} does not weigh them: "
     seen += "selector.nats_per_cost is 0"
-    advice = "Set selector.nats_per_cost to 0.69 / the price that halving the uncertainty of one "
-    advice += "coordinate is worth, or selector.method: expected_return."
+    worth = f"{nats_of_halving(inspection.settings):.2f} (the nats that it gains) / the price that "
+    worth += "halving the uncertainty of one coordinate is worth"
+    if selector.method == "action_covariance":
+        worth = "how much smaller the trace of the covariance must become for a price of 1"
+    advice = f"Set selector.nats_per_cost to {worth}, or selector.method: expected_return."
     inspection.add("warning", "prices", seen, advice)
 
 

@@ -20,6 +20,7 @@ from holdfast.planning.inputs import Sensed
 from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, SimulatorSettings, check_settings
+from holdfast.printable import brief
 from holdfast.problems.attributes import sensing_costs
 from holdfast.problems.problem import Problem
 from holdfast.reports.outcome_comparison import (
@@ -262,13 +263,13 @@ def compare(
         If a path is no run, or if limits or (paired) seeds differ, or there are too few trials.
     """
     if not isinstance(runs, Mapping) or len(runs) < 2:
-        raise InvalidValueError(f"runs is {runs!r:.80}; compare takes a mapping of at least 2")
+        raise InvalidValueError(f"runs is {brief(runs)}; compare takes a mapping of at least 2")
     names = list(runs)
     if not isinstance(paired, bool):
-        raise InvalidValueError(f"paired is {paired!r:.80}; it must be True or False")
+        raise InvalidValueError(f"paired is {brief(paired)}; it must be True or False")
     if baseline is not None:
         if not isinstance(baseline, str) or baseline not in runs:
-            raise InvalidValueError(f"baseline is {baseline!r:.80}; it must be one of {names}")
+            raise InvalidValueError(f"baseline is {brief(baseline)}; it must be one of {names}")
         names = [baseline, *(name for name in names if name != baseline)]
     return compare_results([_compared(runs[name], name) for name in names], paired=paired)
 

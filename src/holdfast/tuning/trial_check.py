@@ -24,13 +24,7 @@ from holdfast.numerics.randomness import NoiseFreeStream
 from holdfast.planning.belief import Belief
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
-from holdfast.problems import checked
-from holdfast.problems.attributes import (
-    PARAMETERS,
-    circular_actions,
-    circular_states,
-    sensing_labels,
-)
+from holdfast.problems import attributes, checked
 from holdfast.problems.problem import ProblemBase
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
@@ -117,8 +111,8 @@ def _report_angles(inspection: Inspection, jumps: IntArray, turns: IntArray) -> 
     """Warn of coordinates whose large changes are all whole turns, as if they were angles."""
     problem = inspection.problem
     for counts, attribute, declared, whose in (
-        (jumps, "circular", circular_states(problem), "a state"),
-        (turns, "circular_actions", circular_actions(problem), "the task action"),
+        (jumps, "circular", attributes.circular_states(problem), "a state"),
+        (turns, "circular_actions", attributes.circular_actions(problem), "the task action"),
     ):
         for at in np.flatnonzero((counts[1] >= 2) & (counts[1] == counts[0])).tolist():
             seen = f"coordinate {at} of {whose} jumps by a whole turn (2 pi) in one step, and is "
@@ -194,7 +188,7 @@ def _check_motion(inspection: Inspection, walk: Walk) -> None:
         action = ask("limit_action", acted, problem, state, int(walk.stages[at]))
         moved = ask("move", checked.move, problem, np.tile(state, (_DRAWS, 1)), action, own)
         slopes = ask("move", _slopes, problem, state, action)
-        variance = differences(moved, moved[0], circular_states(problem)).var(axis=0)
+        variance = differences(moved, moved[0], attributes.circular_states(problem)).var(axis=0)
         predicted = (slopes**2 * np.asarray(problem.motion_variance)).sum(axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             ratios.append(np.where(predicted > 0.0, variance / predicted, np.nan))
@@ -218,7 +212,7 @@ def _slopes(problem: Any, state: FloatArray, action: FloatArray) -> FloatArray:
 
     slopes = np.empty((state.size, action.size))
     for at, step in enumerate(np.diag(1e-3 * np.maximum(1.0, np.abs(action)))):
-        change = differences(led(step), led(-step), circular_states(problem))
+        change = differences(led(step), led(-step), attributes.circular_states(problem))
         slopes[:, at] = change / (2.0 * step[at])
     return slopes
 
@@ -242,7 +236,7 @@ class _Watcher(TrialObserver):
         if not self.keep:
             return
         self.steps.append(step)
-        angles = circular_states(self.inspection.problem)
+        angles = attributes.circular_states(self.inspection.problem)
         apart = differences(step.before.belief.states, self.world.state, angles)
         self.outside.append(np.asarray((apart > 0.0).all(axis=0) | (apart < 0.0).all(axis=0)))
 
@@ -365,7 +359,7 @@ def _report_depletion(inspection: Inspection, trials: list[_Watcher]) -> None:
     ]
     particles = inspection.settings.particle_filter.num_particles
     few = []
-    for action in range(len(sensing_labels(inspection.problem))):
+    for action in range(len(attributes.sensing_labels(inspection.problem))):
         sizes = np.array([size for own, size in left if own == action])
         if len(sizes) >= 5 and (share := (sizes < _FEW_LEFT).mean()) > _OFTEN:
             few.append(f"{inspection.label(action)} in {share:.0%} of {len(sizes)} observations")
@@ -413,7 +407,10 @@ def check_decision_time(inspection: Inspection) -> None:
     for state in [initial, *(inspection.beliefs[index] for index in some)]:
         if not (taken and late()):
             inspection.ask("a decision", decide, state, check="time")
-    codes = {getattr(getattr(problem, each, None), "__code__", None): each for each in PARAMETERS}
+    codes = {
+        getattr(getattr(problem, each, None), "__code__", None): each
+        for each in attributes.PARAMETERS
+    }
     entries = sorted(profile.getstats(), key=lambda entry: -entry.totaltime)
     parts = [
         f"{entry.totaltime / entries[0].totaltime:.0%} in {codes[entry.code]} "

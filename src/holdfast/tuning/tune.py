@@ -28,6 +28,7 @@ from holdfast.config.loader import Configuration, load
 from holdfast.errors import InvalidValueError, TrialCrashError, TrialError, WorkerDiedError
 from holdfast.journal.fingerprint import fingerprint
 from holdfast.numerics.arrays import FloatArray, real_number, whole
+from holdfast.printable import brief
 from holdfast.robot.trial_pool import Arm, TrialPool
 from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.machine import available_cores
@@ -131,17 +132,17 @@ def tune(
     for each in vary if isinstance(vary, list | tuple) else [vary]:
         if not isinstance(each, str) or each not in VARIATIONS:
             allowed = ", ".join(VARIATIONS)
-            raise InvalidValueError(f"vary has {each!r:.80}; allowed are {allowed}")
+            raise InvalidValueError(f"vary has {brief(each)}; allowed are {allowed}")
     as_function("on_progress", on_progress)
     most = whole("most", most, 2, FRESH - 1)
     jobs = None if jobs is None else whole("jobs", jobs, 1, MAX_JOBS)
     for name, value in (("budget_s", budget_s), ("max_decision_ms", max_decision_ms)):
         number = real_number(value)
         if number is None or not number > 0.0:
-            raise InvalidValueError(f"{name} is {value!r:.80}; it must be a number above 0")
+            raise InvalidValueError(f"{name} is {brief(value)}; it must be a number above 0")
     if objective not in (None, *get_args(Objective)):
         allowed = ", ".join(get_args(Objective))
-        raise InvalidValueError(f"objective is {objective!r:.80}; allowed are {allowed}")
+        raise InvalidValueError(f"objective is {brief(objective)}; allowed are {allowed}")
     out = None if out is None else as_path("out", out)
     if objective is None:
         priced = getattr(configuration.problem, "sensing_costs", None) is not None
