@@ -453,9 +453,10 @@ class TestCommand:
             command = [sys.executable, "-m", "holdfast", "keys", str(tmp_path), "--rotate"]
             with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as second:
                 assert second.stderr is not None
-                assert "another 'holdfast keys' is at work" in second.stderr.readline()
-                first.stdin.write("go on\n")
+                said = second.stderr.readline()
+                first.stdin.write("go on\n")  # before anything fails: the second waits for it
                 first.stdin.flush()
+                assert "another 'holdfast keys' is at work" in said
                 _, errors = second.communicate(timeout=60)
             assert (first.wait(60), second.returncode, errors) == (0, 0, "")
         load_credentials(tmp_path / "anna", "robot")
