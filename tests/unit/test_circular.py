@@ -262,5 +262,5 @@ class TestObservations:
             def sample_observation(self, state: Any, sensing_action: int, stream: Stream) -> Any:
                 return state[:1]
 
-        with pytest.raises(ProblemError, match="no effect beside log_likelihood"):
+        with pytest.raises(ProblemError, match="does nothing beside log_likelihood"):
             hf.Planner(General()).init(1)

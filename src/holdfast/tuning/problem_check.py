@@ -86,9 +86,7 @@ def check_problem(
     seed = whole("seed", seed, 0, 2**63 - 1)
     budget = real_number(budget_s)
     if budget is None or not 0.0 < budget <= 86_400.0:
-        raise InvalidValueError(
-            f"budget_s is {brief(budget_s)}; allowed are numbers above 0 to 86400"
-        )
+        raise InvalidValueError(f"budget_s is {brief(budget_s)}; it must be above 0, at most 86400")
     inspection = Inspection(problem, settings, max_steps, seed, budget)
     inspection.trials = whole("trials", trials, 0, MAX_TRIALS)
     late = inspection.deadline(1.0)
