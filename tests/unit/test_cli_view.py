@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from rerun.chunk import RrdReader
 from tests.command_line import Said, run_here
 
-from holdfast.reports import rerun_streams
+from holdfast.reports import live_follower, live_view, rerun_streams
 
 RUN = """
 problem: peg_in_hole_2d
@@ -50,6 +51,12 @@ def log_of(file: Path) -> list[str]:
 
 def summary_of(run: Path) -> Any:
     return json.loads((run / "summary.json").read_text())
+
+
+def follow_patiently(*arguments: Any) -> None:
+    """Show all steps, however late a busy machine reads them."""
+    vars(live_follower)["_LATE_NS"] = 10**18
+    live_follower.follow(*arguments)
 
 
 class TestARecordedRun:
@@ -107,8 +114,12 @@ class TestARecordedRun:
 
 class TestARunThatGoesOn:
     def test_the_same_decisions_and_steps(
-        self, here: Path, capsys: pytest.CaptureFixture[str]
+        self, here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        patient = partial(live_view.LiveView, work=follow_patiently)
+        monkeypatch.setattr(live_view, "LiveView", patient)
+        monkeypatch.setattr(live_view, "_CLOSE_S", 600.0)
+        monkeypatch.setattr(live_view, "_START_S", 600.0)
         words = ["run", "run.yaml", "--out", "live", "--view-file", "live.rrd"]
         said = done(run_here(capsys, here, *words))
         assert "the view" not in said.stderr
