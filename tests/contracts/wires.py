@@ -29,7 +29,13 @@ from tests.ports import free_port
 from tests.processes.faults import PATIENT
 
 from holdfast.protocol.messages import Refused, decode_reply
-from holdfast.protocol.robot_events import CallEnded, ReplyReceived, ServiceAppeared, TransportEvent
+from holdfast.protocol.robot_events import (
+    CallEnded,
+    ReplyReceived,
+    ServiceAppeared,
+    ServiceVanished,
+    TransportEvent,
+)
 from holdfast.transport import frames
 from holdfast.transport.contract import IncomingCall, RobotTransport, ServiceTransport
 from holdfast.transport.endpoints import TlsFiles
@@ -103,8 +109,9 @@ class Inbox:
         return self.count(event) > 0
 
     def count(self, event: TransportEvent) -> int:
-        # By type as well: named tuples are equal if their fields are.
-        return sum(type(each) is type(event) and each == event for each in self.events)
+        # By type as well: named tuples are equal if their fields are. For no reason: for any.
+        size = 2 if isinstance(event, ServiceVanished) and not event.reason else len(event)
+        return sum(type(e) is type(event) and e[:size] == event[:size] for e in self.events)
 
     async def of_call(self, call: int) -> list[TransportEvent]:
         """Wait for the end of a call and return what came of it."""

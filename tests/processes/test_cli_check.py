@@ -10,7 +10,7 @@ from tests.command_line import run_here
 
 import holdfast as hf
 from holdfast.cli.check import main
-from holdfast.errors import HoldfastError, InvalidValueError, ProblemError, UnknownProblemError
+from holdfast.errors import HoldfastError, ProblemError, UnknownProblemError
 from holdfast.tuning import check_process
 
 SOURCE = """
@@ -137,5 +137,5 @@ def test_what_is_no_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(HoldfastError, match="there is no such file"):
         main(["none.yaml"])
     Path("a.yaml").write_text("problem: capsule_robot\n")
-    with pytest.raises(InvalidValueError, match="--problem-directory goes with module:Class"):
+    with pytest.raises(HoldfastError, match="only a problem that is named module:Class has one"):
         main(["a.yaml", "--problem-directory", "."])
