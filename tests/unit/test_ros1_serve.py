@@ -1,61 +1,11 @@
-"""``holdfast ros1-serve`` starts only if all that it is to offer can be offered."""
+"""``holdfast ros1-serve`` as a command among the others; test_ros1_process.py has the rest."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 from tests.command_line import run_here
-
-from holdfast_ros import messages
-
-EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        ([], "--configuration is missing"),
-        (["--configuration", "x.yaml", "--processes", "2"], "--processes 2: a node of ROS 1 is"),
-        (["--configuration", "none.yaml"], "there is no such file"),
-        (["--configuration", str(EXAMPLE), "--ros1-name", "a-b"], "--ros1-name: 'a-b' is no name"),
-        (["--configuration", str(EXAMPLE), "--workers", "0"], "from 1 to 256"),
-    ],
-)
-def test_it_says_why(
-    arguments: list[str],
-    text: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("ROS_HOSTNAME", "127.0.0.1")
-    said = run_here(capsys, tmp_path, "ros1-serve", *arguments)
-    assert (said.code, said.stdout) == (2, "")
-    assert said.stderr.startswith("holdfast: error: ")
-    assert text in said.stderr
-
-
-def test_an_address_that_others_reach_is_refused(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ROS_IP", "192.0.2.1")
-    monkeypatch.delenv("ROS_HOSTNAME", raising=False)
-    said = run_here(capsys, tmp_path, "ros1-serve", "--configuration", str(EXAMPLE))
-    assert said.code == 2
-    assert "no peer proves its identity" in said.stderr
-
-
-def test_it_says_what_it_lacks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    messages.typestore.cache_clear()
-    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    monkeypatch.setenv("ROS_HOSTNAME", "127.0.0.1")
-    said = run_here(capsys, tmp_path, "ros1-serve", "--configuration", str(EXAMPLE))
-    assert (said.code, said.stdout) == (2, "")
-    assert "ROS messages need rosbags: pip install rosbags" in said.stderr
 
 
 def test_it_has_the_options_of_serve(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

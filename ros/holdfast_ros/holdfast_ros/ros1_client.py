@@ -25,12 +25,7 @@ from holdfast_ros.messages import MAX_BYTES, decode_answer, encode_request, md5_
 from holdfast_ros.ros1_environment import RosEnvironment, RosType
 from holdfast_ros.ros1_node import RosNode
 from ros1_master_guard.errors import CallError, GoneError, ProtocolError
-from ros1_master_guard.headers import (
-    MAX_HEADER_BYTES,
-    decode_header,
-    encode_header,
-    encode_message,
-)
+from ros1_master_guard.headers import MAX_HEADER_BYTES, decode_header, encode_header, encode_message
 from ros1_master_guard.ros1_calls import call, connect, message
 
 STATUS_WORDS: Final = {

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from holdfast.cli.exit_codes import ended_by_signals
-from holdfast.cli.run_figure import require_matplotlib
 from holdfast.cli.terminal import counted, progress_line
 from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import HoldfastError, OptionError, OutputError
@@ -41,9 +40,8 @@ _PICTURES = (".pdf", ".png", ".svg")
 def trial_range(text: str) -> range:
     """Read ``A:B``, or ``N`` for one trial."""
     match = _RANGE.fullmatch(text)
-    begin, end = (
-        (int(match[1]), int(match[2] or int(match[1]) + 1)) if match else (0, MAX_TRIALS + 1)
-    )
+    begin = int(match[1]) if match else 0
+    end = int(match[2] or begin + 1) if match else MAX_TRIALS + 1
     if end > MAX_TRIALS:
         raise bad_value(text, f"one trial N, or A:B from 0 to {MAX_TRIALS}, such as 7 or 0:5")
     if begin >= end:
@@ -135,6 +133,8 @@ def _export(options: ExportOptions) -> None:
         if mcap == tables:
             raise OptionError(f"--mcap and --csv are both {shown_path(mcap)}; give two places")
     if options.figure is not None:
+        from holdfast.cli.run_figure import require_matplotlib
+
         require_matplotlib()
         require_free(options.figure, "--figure", directory=False)
         if mcap == options.figure or tables == options.figure:
@@ -143,6 +143,8 @@ def _export(options: ExportOptions) -> None:
 
     with RecordedRun(path, problem_directory=options.problem_directory) as recorded:
         trials = chosen_trials(recorded, wanted)
+        if mcap is None and tables is None:
+            trials = trials[:1]  # the figure needs no other
         notes = _write(recorded, trials, options)
     print_written([] if options.quiet else notes, mcap, tables, options.figure)
 
@@ -167,9 +169,7 @@ def chosen_trials(recorded: RecordedRun, wanted: range | None) -> list[int]:
 
 def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions) -> list[str]:
     """Write all of it beside its places, and move it there when all is whole; return notes."""
-    from holdfast.planning.planner import Planner
     from holdfast.reports.csv_export import CsvSink
-    from holdfast.reports.recorder import Recorder
 
     mcap, tables = options.mcap, options.tables
     notes = notes_about(recorded)
@@ -199,8 +199,12 @@ def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions)
                     files.enter_context(CsvSink(directory, recorded.configuration.problem))
                 )
                 made.append((directory, tables))
-            planner = Planner(recorded.configuration.problem, recorded.configuration.planning)
-            recorded.observer = first = Recorder(trials[0], planner)
+            if options.figure is not None:
+                from holdfast.planning.planner import Planner
+                from holdfast.reports.recorder import Recorder
+
+                planner = Planner(recorded.configuration.problem, recorded.configuration.planning)
+                recorded.observer = first = Recorder(trials[0], planner)
             replay_trials(recorded, trials, sinks, quiet=options.quiet)
         if options.figure is not None:
             from holdfast.reports.figure import trial_figure

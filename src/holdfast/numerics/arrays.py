@@ -54,7 +54,7 @@ def in_brief(values: object) -> str:
     try:
         array = np.asarray(values)
     except (TypeError, ValueError):
-        return f"{brief(values)}"  # A ragged list.
+        return brief(values)  # A ragged list.
     return np.array2string(array, max_line_width=sys.maxsize, threshold=2 * _EDGE, edgeitems=_EDGE)
 
 

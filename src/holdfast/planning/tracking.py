@@ -100,8 +100,7 @@ class Trial:
     def actions(self) -> list[FloatArray]:
         """The task actions that were performed, in order."""
         decided = self.log.decisions()
-        acted = (each.action for each in decided if isinstance(each, ActingRecord))
-        return [decode_floats(action, None) for action in acted]
+        return [each.task_action for each in decided if isinstance(each, ActingRecord)]
 
     def take(self, given: _GivenT) -> _GivenT:
         """Fold in a record; return it with the digest of the state that it leads to.

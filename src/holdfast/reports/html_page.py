@@ -126,6 +126,7 @@ class HtmlPage:
         head = f"<h1>{_escaped(self._title)}</h1>\n<nav>{''.join(names)}</nav>\n"
         page = Template((folder / "html_page.html").read_text("utf-8")).substitute(
             title=_escaped(self._title),
+            generator=GENERATOR.decode(),
             hashes=" ".join(f"'sha256-{base64.b64encode(each).decode()}'" for each in hashes),
             body=head + "\n".join(self._parts),
             charts=_data(self._charts),

@@ -18,11 +18,7 @@ from holdfast.config.user_code import describe_problem_error
 from holdfast.errors import HoldfastError, OutputError, UntrustedCodeError
 from holdfast.journal.fingerprint import read_earlier
 from holdfast.journal.journal_reader import JournalReader
-from holdfast.journal.run_directory import (
-    TIMINGS_NAME,
-    VERIFICATION_NAME,
-    recorded_configuration,
-)
+from holdfast.journal.run_directory import TIMINGS_NAME, VERIFICATION_NAME, recorded_configuration
 from holdfast.journal.timings import TimingRow, count_answers, count_verified
 from holdfast.planning.outcome import COUNTS, TrialResult
 from holdfast.printable import one_line

@@ -197,6 +197,7 @@ class _Collector:
         sensing, tasks, end = self._sensing, self._tasks, self._end
         assert end is not None
         acted = [task.step for task in tasks]
+        moved = [step.moved.numbers() for step in acted]
         actions = np.array([step.executed for step in acted]).reshape(-1, action_size)
         steps = np.array([each.before.step for each in sensing], dtype=np.int64)
         chosen = np.array([each.sensing_action for each in sensing], dtype=np.int64)
@@ -223,8 +224,8 @@ class _Collector:
             stages=np.array([step.task_info.stage for step in acted], dtype=np.int64),
             rewards=np.array(rewards, dtype=np.float64),
             true_states=np.array(true_states) if true_states else None,
-            motions=tuple(_shown(step.moved.numbers()[0]) for step in acted),
-            move_observations=tuple(_shown(step.moved.numbers()[1]) for step in acted),
+            motions=tuple(_shown(motion) for motion, _ in moved),
+            move_observations=tuple(_shown(observation) for _, observation in moved),
         )
 
 

@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Literal, TypeAlias
 
+import msgspec
+
 from holdfast.printable import one_line
 
 LogFormat: TypeAlias = Literal["text", "json"]
@@ -92,8 +94,6 @@ def fields_as_text(fields: Mapping[str, object]) -> str:
 
 def _json(value: object) -> str:
     """Encode plain data; numbers that are not finite become null, what is unprintable escapes."""
-    import msgspec  # not for --help, which needs the options of logs
-
     text = msgspec.json.encode(value).decode()
     if text.isprintable():
         return text

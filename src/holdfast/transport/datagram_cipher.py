@@ -29,8 +29,9 @@ OVERHEAD = _HEADER.size + _TAG_BYTES
 """Bytes that a datagram is longer than its message."""
 
 WINDOW = 1024
-_ALL_SEEN = (1 << WINDOW) - 1
 """Counters below the newest that are still accepted."""
+
+_ALL_SEEN = (1 << WINDOW) - 1
 
 LOSS_SAMPLE = 128
 """Counters over which losses are counted."""
