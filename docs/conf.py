@@ -127,7 +127,8 @@ def adapt(app: Any, page: str, source: list[str]) -> None:
         if file.is_dir() and (file / "README.md").resolve() in own:
             file = own[(file / "README.md").resolve()]
         if file.is_dir():
-            return f"{words} (`{file.relative_to(ROOT)}`)"
+            where = file.relative_to(ROOT).as_posix()
+            return f"`{where}`" if where.endswith(words.strip("/")) else f"{words} (`{where}`)"
         return f"{image}[{words}]({os.path.relpath(file, here)}{anchor})"
 
     if page == "start":
