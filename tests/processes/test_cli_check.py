@@ -139,3 +139,7 @@ def test_what_is_no_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     Path("a.yaml").write_text("problem: capsule_robot\n")
     with pytest.raises(HoldfastError, match="only a problem that is named module:Class has one"):
         main(["a.yaml", "--problem-directory", "."])
+    with pytest.raises(HoldfastError, match="both say what problem_directory is"):
+        main(["a.yaml", "--problem-directory", ".", "--set", "problem_directory=.."])
+    with pytest.raises(HoldfastError, match="only a problem that is named module:Class has one"):
+        main(["capsule_robot", "--set", "problem_directory=."])

@@ -73,7 +73,7 @@ def test_refusals(tmp_path: Path) -> None:
         ("--set", "selector.method=rnd,random"): 'is "rnd"; expected one of',
         (*SET, "--baseline", "selector.method=fixed"): "no combination has that; they are",
         (*SET, "--resume"): "--resume needs --out",
-        (*SET, "--seed", "1", "--set", "simulator.seed=2"): "--seed and --set both say",
+        (*SET, "--seed", "1", "--set", "simulator.seed=2"): "both say what simulator.seed is",
     }.items():
         refused = holdfast(tmp_path, "sweep", "peg.yaml", *words)
         assert refused.returncode == 2

@@ -76,6 +76,7 @@ class TestProblemBase:
     [
         ({"body": [1, 2, 3]}, r"body of a Scene has the shape \(3,\): must be \(any number, 2\)"),
         ({"body": "boat"}, "body of a Scene is 'boat': must be numbers"),
+        ({"body": -1.0}, "body of a Scene is -1.0: a radius must be above 0"),
         ({"goal": [1, 2, 3]}, r"goal of a Scene has the shape \(3,\): must be \(2\)"),
         ({"limits": (1, 2, 3)}, r"limits of a Scene has the shape \(3,\): must be \(4\)"),
         ({"obstacles": [1, 2, 3]}, r"obstacles of a Scene .* must be \(any number, 4\)"),

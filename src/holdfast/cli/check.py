@@ -7,11 +7,12 @@ import json
 import shutil
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals
+from holdfast.cli.overrides import combined, overrides_of
 from holdfast.errors import ConfigurationError
 from holdfast.printable import printable
 from holdfast.runtime import command_line
@@ -44,6 +45,7 @@ class CheckOptions(command_line.Options):
     problem_directory: Path | None = command_line.option(
         metavar="DIR",
         read=command_line.location,
+        key="problem_directory",
         help="Where the module of module:Class is (default: here, or where the file says).",
     )
     seed: int = command_line.option(
@@ -81,12 +83,11 @@ def main(arguments: Sequence[str]) -> int:
 
     line = progress_line(len(CHECKS), quiet=options.quiet or options.json, noun="check")
     names = list(CHECKS)
+    given = combined(overrides_of(options, options.assignments))
     line.start(f"checking {options.problem}", 0, "")
     try:
         found = check_apart(
-            functools.partial(
-                _configuration, options.problem, options.problem_directory, options.assignments
-            ),
+            functools.partial(_configuration, options.problem, given),
             seed=options.seed,
             budget_s=options.budget,
             trials=options.trials,
@@ -108,22 +109,14 @@ def main(arguments: Sequence[str]) -> int:
     return EXIT_DIFFERENT if errors else 0
 
 
-def _configuration(
-    problem: str, directory: Path | None, assignments: Sequence[str]
-) -> Configuration:
+def _configuration(problem: str, given: Mapping[str, Any]) -> Configuration:
     """Return the configuration of a file, or one of defaults for a problem's name."""
-    from holdfast.cli.overrides import combined, parse_assignment
     from holdfast.config.loader import Configuration, load
     from holdfast.config.source import put_at
 
-    given = combined(parse_assignment(each) for each in assignments)
     if problem.endswith((".yaml", ".yml")) or Path(problem).is_file():
-        if directory is not None:
-            given["problem_directory"] = str(directory)
         return load(Path(problem).absolute(), overrides=given)
     sections: dict[str, object] = {"problem": problem}
-    if directory is not None:
-        sections["problem_directory"] = str(directory)
     for name, value in given.items():
         put_at(sections, name, value)
     path = str(Path.cwd() / problem.replace("/", "_"))

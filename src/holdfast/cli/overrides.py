@@ -8,9 +8,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from holdfast.errors import InvalidValueError
+from holdfast.runtime.files import shown_path
+
+if TYPE_CHECKING:
+    from holdfast.runtime.command_line import Options
 
 
 class Override(NamedTuple):
@@ -62,6 +67,19 @@ def parse_values(assignment: str) -> Override:
     name, equals, text = assignment.partition("=")
     found = parse_assignment(f"{name}{equals}[{text}]" if text.strip() else assignment)
     return found._replace(words=f"--set {assignment}")
+
+
+def overrides_of(options: Options, assignments: Iterable[str] = ()) -> list[Override]:
+    """Return what ``--set`` assigns, and the options that stand for a key of the file."""
+    given = [*map(parse_assignment, assignments)]
+    for name, each in options.table().items():
+        value = getattr(options, name)
+        if each.key is not None and value != each.default:
+            plain = list(value) if each.many else value
+            if isinstance(value, Path):
+                plain = shown_path(value)
+            given.append(Override(" ".join(each.words(value)), each.key, plain))
+    return given
 
 
 def combined(overrides: Iterable[Override]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from holdfast.cli.overrides import Override, combined, parse_assignment
+from holdfast.cli.overrides import Override, combined, overrides_of
 from holdfast.errors import InvalidValueError
 from holdfast.reports.view_target import ViewTarget, viewer_url
 from holdfast.runtime import command_line
@@ -164,15 +164,7 @@ class RunOptions(command_line.Options):
 
     def overrides(self) -> list[Override]:
         """Return the values that replace those of the file."""
-        given = []
-        for name, each in self.table().items():
-            value = getattr(self, name)
-            if each.key is not None and value != each.default:
-                plain = list(value) if each.many else value
-                if isinstance(value, Path):
-                    plain = shown_path(value)
-                given.append(Override(" ".join(each.words(value)), each.key, plain))
-        return [*map(parse_assignment, self.assignments), *given]
+        return overrides_of(self, self.assignments)
 
     def load(self) -> Configuration:
         """Read the configuration, with the values that replace those of the file."""

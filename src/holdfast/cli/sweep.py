@@ -7,7 +7,7 @@ import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.cli.exit_codes import (
     EXIT_CAN_GO_ON,
@@ -16,7 +16,7 @@ from holdfast.cli.exit_codes import (
     interrupted_by,
     say_interrupted,
 )
-from holdfast.cli.overrides import combined, parse_assignment, parse_values
+from holdfast.cli.overrides import combined, overrides_of, parse_assignment, parse_values
 from holdfast.cli.terminal import counted, progress_line
 from holdfast.errors import HoldfastError, InvalidValueError, RunError
 from holdfast.printable import printable
@@ -81,17 +81,10 @@ class SweepOptions(command_line.Options):
         from holdfast.config.loader import load
         from holdfast.tuning.sweep import arms_of
 
-        axes = combined(map(parse_values, self.assignments))
-        given: dict[str, Any] = {}
-        for name in ("trials", "seed", "problem_directory"):
-            own, value = self.table()[name], getattr(self, name)
-            if value is not None and own.key in axes:
-                raise InvalidValueError(f"{own.names[0]} and --set both say what {own.key} is")
-            if value is not None:
-                given[str(own.key)] = str(value) if isinstance(value, Path) else value
-
-        path = shown_path(self.configuration)
-        return arms_of(axes, lambda values: load(path, overrides={**given, **values}))
+        axes, given = [*map(parse_values, self.assignments)], overrides_of(self)
+        combined(axes + given)
+        path, fixed = shown_path(self.configuration), combined(given)
+        return arms_of(combined(axes), lambda values: load(path, overrides={**fixed, **values}))
 
 
 @ended_by_signals()

@@ -17,7 +17,7 @@ from holdfast.cli.exit_codes import (
     interrupted_by,
     say_interrupted,
 )
-from holdfast.cli.overrides import combined, parse_assignment
+from holdfast.cli.overrides import combined, overrides_of
 from holdfast.cli.terminal import duration, progress_line
 from holdfast.errors import InvalidValueError, OutputError, RunError, WorkerDiedError
 from holdfast.printable import printable
@@ -138,12 +138,10 @@ def main(arguments: Sequence[str]) -> int:
             sys.stderr.write(printable(f"note: {found.check}: {found.seen}\n"))
 
     runs, began_s, budget_s = Path("runs").absolute(), monotonic(), _seconds(options.budget)
-    given = combined(map(parse_assignment, options.assignments))
-    if options.problem_directory is not None:
-        given["problem_directory"] = str(options.problem_directory)
+    given = combined(overrides_of(options, options.assignments))
     path = shown_path(options.configuration)
     with goes_on(options if options.resume else None, "tune"):
-        configuration = load(path, problem=options.problem, seed=options.seed, overrides=given)
+        configuration = load(path, problem=options.problem, overrides=given)
     if options.check and not options.resume:
         require_right(configuration, budget_s, warn)
     if options.resume:

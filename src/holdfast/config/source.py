@@ -182,7 +182,7 @@ def put_at(data: dict[str, Any], key: str, value: Any) -> KeyPath:
     inner: Any = data
     path: list[str | int] = []
     *way, last = key.split(".")
-    for part, below in zip(way, [*way[1:], last], strict=True):
+    for part, below in zip(way, [*way, last][1:], strict=True):
         path.append(int(part) if isinstance(inner, list) else part)
         # What these hold where a file lacks them is known: nothing. What a constructor has by
         # default is not, and would be lost.

@@ -109,6 +109,8 @@ class Scene:
         if body is not None:
             is_radius = isinstance(body, str | float | int | np.number)
             outline = _in_scene("body", body, () if is_radius else (None, 2))
+            if is_radius and not outline > 0.0:
+                raise ProblemError(f"body of a Scene is {brief(body)}: a radius must be above 0")
             body = float(outline) if is_radius else outline
         self.body = body
         self.angle: int | None = _of_state("angle", angle)
