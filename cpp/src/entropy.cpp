@@ -102,10 +102,17 @@ double entropy_of_one(const Task& task) {
            static_cast<double>(task.dimension) * log(task.constants.resolution);
 }
 
-/// The surviving points of one posterior, coordinate by coordinate, for `compact_*`.
+/// Whether a posterior that has points of its own is one of `few_nearest`.
+bool are_few(const Task& task, std::size_t survivors) {
+    return survivors <= few_points && task.settings->neighbors <= 8 &&
+           task.settings->estimator == Estimator::nearest_neighbor;
+}
+
+/// The surviving points of one posterior, coordinate by coordinate, for `compact_*` and
+/// `few_nearest`.
 double compact_entropy(const Task& task, const double* weights, std::size_t survivors,
                        std::uint64_t& visits) {
-    const std::size_t stride = (survivors + lane_count - 1) / lane_count * lane_count;
+    const std::size_t stride = (survivors + leaf_size - 1) / leaf_size * leaf_size;
     thread_local std::vector<double> buffer;
     buffer.resize(stride * (task.dimension + 1) + lane_count * (stride + task.settings->neighbors));
     double* coordinates = buffer.data();
@@ -127,8 +134,9 @@ double compact_entropy(const Task& task, const double* weights, std::size_t surv
     if (task.settings->estimator == Estimator::gaussian_mixture) {
         return task.kernels->compact_mixture(posterior, task.settings->exponent, &visits);
     }
-    return task.kernels->compact_nearest(posterior, neighbors_among(task, survivors),
-                                         task.constants, &visits);
+    const auto nearest =
+        survivors > compact_limit ? task.kernels->few_nearest : task.kernels->compact_nearest;
+    return nearest(posterior, neighbors_among(task, survivors), task.constants, &visits);
 }
 
 /// Posteriors side by side over one tree; owns what PosteriorGroup points to.
@@ -404,7 +412,7 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
                          if (variance) {
                              values[at] = total_variance(task, w);
                              visits[at] = count;
-                         } else if (survivors[i] <= compact_limit) {
+                         } else if (survivors[i] <= compact_limit || are_few(task, survivors[i])) {
                              values[at] = settings.offset +
                                           compact_entropy(task, w, survivors[i], visits[at]);
                          } else {

@@ -58,6 +58,9 @@ class PointTree {
     std::vector<double> low, high;
 
   private:
+    std::vector<double> keys_;
+    std::vector<std::uint32_t> rest_;
+
     std::uint32_t build(const double* points, std::uint32_t first_leaf, std::uint32_t last_leaf);
 };
 

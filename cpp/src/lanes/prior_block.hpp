@@ -193,26 +193,17 @@ static void neighborhoods_of(const PriorGroup& group, const std::uint32_t* point
 /// Points whose sums are made beside each other, so that no addition waits for the one before.
 inline constexpr std::size_t sums_together = registers == 1 ? 4 : 2;
 
-/// sums[i] = the sum over the i-th point's numbers, in their order, of eight posteriors' rows.
-template <std::size_t points>
+/// totals[p] += the rows of eight posteriors at the p-th point's numbers from the i-th on, in their
+/// order. The numbers of members do not fall.
+template <std::size_t first = 0>
 HOLDFAST_INLINE void sum_rows(const double* rows, const std::uint32_t* const* numbers,
-                              const std::size_t* members, Lanes* sums) {
-    std::size_t shortest = members[0];
-    for (std::size_t p = 1; p < points; ++p) {
-        if (members[p] < shortest) shortest = members[p];
-    }
-    Lanes totals[points] = {};
-    for (std::size_t i = 0; i < shortest; ++i) {
-        for (std::size_t p = 0; p < points; ++p) {
+                              const std::size_t* members, Lanes* totals, std::size_t i = 0) {
+    for (; i < members[first]; ++i) {
+        for (std::size_t p = first; p < sums_together; ++p) {
             totals[p] += load(rows + numbers[p][i] * lane_count);
         }
     }
-    for (std::size_t p = 0; p < points; ++p) {
-        for (std::size_t i = shortest; i < members[p]; ++i) {
-            totals[p] += load(rows + numbers[p][i] * lane_count);
-        }
-        sums[p] = totals[p];
-    }
+    if constexpr (first + 1 < sums_together) sum_rows<first + 1>(rows, numbers, members, totals, i);
 }
 
 /// The sums of equal points, which have one ball: sums[i] lacks the own[i]-th of its numbers. Own
@@ -352,6 +343,21 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
         places.end_of_equals[0] = 1;
         places.inverse_masses[0] = 1.0;
     }
+    // Those that have no equal, by the number of their neighbours: sums beside each other should
+    // end together.
+    std::size_t singles[prior_block_size], num_singles = 0;
+    for (std::size_t place = 0; place < count; ++place) {
+        if (places.end_of_equals[place] != place + 1 ||
+            (place > 0 && places.end_of_equals[place - 1] == place + 1)) {
+            continue;
+        }
+        std::size_t at = num_singles++;
+        const std::size_t members = places.around[place].members;
+        for (; at > 0 && places.around[singles[at - 1]].members > members; --at) {
+            singles[at] = singles[at - 1];
+        }
+        singles[at] = place;
+    }
     for (std::size_t v = 0; v < group.vectors; ++v) {
         // One vector of posteriors after the other: its rows stay in the first cache.
         const double* const rows = group.weights + v * group.count * lane_count;
@@ -361,12 +367,10 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
             store(gains + (n * group.vectors + v) * lane_count, Lanes{});
             return false;
         };
-        std::size_t chosen[prior_block_size], single = 0;
         Lanes sums[sums_together];
         for (std::size_t place = 0; place < count;) {
             const std::size_t end_of_equals = places.end_of_equals[place];
             if (end_of_equals - place == 1) {
-                if (has_weight(place)) chosen[single++] = place;
                 ++place;
                 continue;
             }
@@ -389,22 +393,22 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
                 }
             }
         }
-        for (std::size_t first = 0; first < single; first += sums_together) {
+        std::size_t chosen[prior_block_size], number = 0;
+        for (std::size_t s = 0; s < num_singles; ++s) {
+            if (has_weight(singles[s])) chosen[number++] = singles[s];
+        }
+        for (std::size_t first = 0; first < number; first += sums_together) {
             const std::size_t here =
-                single - first < sums_together ? single - first : sums_together;
+                number - first < sums_together ? number - first : sums_together;
             const std::uint32_t* numbers[sums_together];
             std::size_t members[sums_together];
-            for (std::size_t i = 0; i < here; ++i) {
-                numbers[i] = places.numbers[chosen[first + i]];
-                members[i] = places.around[chosen[first + i]].members;
+            for (std::size_t i = 0; i < sums_together; ++i) {
+                const std::size_t place = chosen[first + (i < here ? i : here - 1)];
+                numbers[i] = places.numbers[place];
+                members[i] = places.around[place].members;
+                sums[i] = Lanes{};
             }
-            if (here == sums_together) {
-                sum_rows<sums_together>(rows, numbers, members, sums);
-            } else {
-                for (std::size_t i = 0; i < here; ++i) {
-                    sum_rows<1>(rows, numbers + i, members + i, sums + i);
-                }
-            }
+            sum_rows(rows, numbers, members, sums);
             for (std::size_t i = 0; i < here; ++i) {
                 put_gain(group, places, chosen[first + i], v, rows, sums[i], gains);
             }
