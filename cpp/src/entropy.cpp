@@ -102,6 +102,18 @@ double entropy_of_one(const Task& task) {
            static_cast<double>(task.dimension) * log(task.constants.resolution);
 }
 
+/// Puts some points' numbers into the order of a tree over these points.
+void put_in_order_of_tree(const Task& task, std::vector<std::uint32_t>& numbers) {
+    std::vector<double> points(numbers.size() * task.dimension);
+    for (std::size_t i = 0; i < numbers.size(); ++i) {
+        const double* own = task.points + numbers[i] * task.dimension;
+        std::copy(own, own + task.dimension, points.begin() + i * task.dimension);
+    }
+    const PointTree tree(points.data(), numbers.size(), task.dimension);
+    const std::vector<std::uint32_t> before = numbers;
+    for (std::size_t i = 0; i < numbers.size(); ++i) numbers[i] = before[tree.order[i]];
+}
+
 /// Whether a posterior that has points of its own is one of `few_nearest`.
 bool are_few(const Task& task, std::size_t survivors) {
     return survivors <= few_points && task.settings->neighbors <= 8 &&
@@ -117,9 +129,14 @@ double compact_entropy(const Task& task, const double* weights, std::size_t surv
     buffer.resize(stride * (task.dimension + 1) + lane_count * (stride + task.settings->neighbors));
     double* coordinates = buffer.data();
     double* compact_weights = coordinates + stride * task.dimension;
+    thread_local std::vector<std::uint32_t> kept;
+    kept.clear();
+    for (std::uint32_t n = 0; n < task.count; ++n) {
+        if (weights[n] != 0.0) kept.push_back(n);
+    }
+    if (survivors > unsorted_leaves * leaf_size) put_in_order_of_tree(task, kept);
     std::size_t at = 0;
-    for (std::size_t n = 0; n < task.count; ++n) {
-        if (weights[n] == 0.0) continue;
+    for (const std::uint32_t n : kept) {
         for (std::size_t c = 0; c < task.dimension; ++c) {
             coordinates[c * stride + at] = task.points[n * task.dimension + c];
         }

@@ -7,8 +7,6 @@ namespace holdfast {
 
 namespace {
 
-constexpr std::size_t unsorted_leaves = 4;
-
 /// The n-th least of some values, which it puts into another order. Without a branch on a value:
 /// that would be wrong half of the time.
 double nth_of(double* values, std::size_t size, std::size_t n) {
@@ -72,12 +70,15 @@ std::uint32_t PointTree::build(const double* points, std::uint32_t first_leaf,
     high.resize(high.size() + dimension, -std::numeric_limits<double>::infinity());
     double* lowest = &low[node * dimension];
     double* highest = &high[node * dimension];
-    for (auto point = begin; point != end; ++point) {
-        for (std::size_t c = 0; c < dimension; ++c) {
+    for (std::size_t c = 0; c < dimension; ++c) {
+        double least = lowest[c], greatest = highest[c];
+        for (auto point = begin; point != end; ++point) {
             const double x = points[*point * dimension + c];
-            lowest[c] = std::min(lowest[c], x);
-            highest[c] = std::max(highest[c], x);
+            least = std::min(least, x);
+            greatest = std::max(greatest, x);
         }
+        lowest[c] = least;
+        highest[c] = greatest;
     }
     if (last_leaf - first_leaf == 1) return node;
     std::size_t widest = 0;
@@ -85,7 +86,6 @@ std::uint32_t PointTree::build(const double* points, std::uint32_t first_leaf,
         if (highest[c] - lowest[c] > highest[widest] - lowest[widest]) widest = c;
     }
     const std::uint32_t middle = first_leaf + (last_leaf - first_leaf) / 2;
-    // Among so few points everything is near everything: their order is as good as any.
     if (leaves > unsorted_leaves) {
         // Of equal coordinates the lower numbers go left. Both halves keep the order of numbers.
         const std::size_t half = (middle - first_leaf) * leaf_size;

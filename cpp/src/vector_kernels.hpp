@@ -63,8 +63,8 @@ struct CompactPosterior {
     double* scratch;  // [stride + the k of the nearest neighbours][8]
 };
 
-/// The most points of few_nearest: as many as four leaves have.
-inline constexpr std::size_t few_points = 4 * leaf_size;
+/// The most points of few_nearest.
+inline constexpr std::size_t few_points = 8 * leaf_size;
 
 /// Points of a prior that are worked on together.
 inline constexpr std::size_t prior_block_size = 32;

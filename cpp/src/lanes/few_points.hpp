@@ -1,10 +1,10 @@
-// The entropy of one posterior with few points, as over a tree of its own of up to four leaves (one
-// compilation per instruction set).
+// The entropy of one posterior with few points, as over a tree of its own (one compilation per
+// instruction set).
 //
 // Eight points stand beside each other, with their distances to all points. What is added, and in
 // which order, is as in group_entropy.hpp, to the bit: lists of the sixteen nearest points, and
-// sums over balls where these do not reach. Such a tree's points stay in the order of their
-// numbers, so there is nothing to sort, and no node that is worth leaving out.
+// sums over balls where these do not reach. Distances to all of so few points take less time than
+// the search for those that count.
 
 #pragma once
 
@@ -83,12 +83,18 @@ HOLDFAST_INLINE void box_distances(const FewPoints& few, std::size_t a, std::siz
                   greatest);
 }
 
+/// A leaf, and the least distance to its box.
+struct Visited {
+    std::size_t leaf;
+    double least;
+};
+
 /// Appends the leaves below a node as find_nearest visits them.
 static void visiting_order(const FewPoints& few, std::size_t query_leaf, std::size_t at,
-                           std::size_t* order, std::size_t& number) {
+                           double least, Visited* order, std::size_t& number) {
     const FewNode& own = few.node[at];
     if (own.left == 0) {
-        order[number++] = own.first_leaf;
+        order[number++] = {own.first_leaf, least};
         return;
     }
     const std::size_t query = few.leaf_node[query_leaf];
@@ -97,8 +103,12 @@ static void visiting_order(const FewPoints& few, std::size_t query_leaf, std::si
     box_distances(few, query, own.right, right_least, unused);
     const bool left_first = left_least != right_least ? left_least < right_least
                                                       : query_leaf < few.node[own.left].last_leaf;
-    visiting_order(few, query_leaf, left_first ? own.left : own.right, order, number);
-    visiting_order(few, query_leaf, left_first ? own.right : own.left, order, number);
+    const auto go_on = [&](bool left) HOLDFAST_LAMBDA {
+        visiting_order(few, query_leaf, left ? own.left : own.right,
+                       left ? left_least : right_least, order, number);
+    };
+    go_on(left_first);
+    go_on(!left_first);
 }
 
 /// Adds what sum_balls adds for eight points of a leaf below a node; `shared` is the leaf's.
@@ -170,12 +180,13 @@ static double searched_term(const CompactPosterior& posterior, std::size_t own,
 }
 
 /// The sixteen nearest points of eight, sorted as find_nearest does.
-static void sort_nearest(const Lanes* distances, const std::size_t* leaves, std::size_t number,
-                         Lanes* best) {
+static void sort_nearest(const Lanes* distances, const Visited* leaves, std::size_t number,
+                         unsigned used, Lanes* best) {
     for (std::size_t l = 0; l < number; ++l) {
+        if (l > 0 && (bits_of(best[few_list - 1] > leaves[l].least) & used) == 0) continue;
         Lanes block[few_list];
         for (std::size_t other = 0; other < leaf_size; ++other) {
-            Lanes distance = distances[leaves[l] * leaf_size + other];
+            Lanes distance = distances[leaves[l].leaf * leaf_size + other];
             distance = select(distance < far_away, distance, splat(far_away));
             block[other] =
                 detail::from_bits<Lanes>((detail::bits(distance) & ~number_bits) |
@@ -208,8 +219,9 @@ static double few_nearest(const CompactPosterior& posterior, std::uint32_t neigh
         double unused, diameter_squared;
         box_distances(few, few.leaf_node[leaf], few.leaf_node[leaf], unused, diameter_squared);
         const bool dense = diameter_squared <= resolution_squared;
-        std::size_t order[few_leaves], ordered = 0;
-        if (!dense) visiting_order(few, leaf, 0, order, ordered);
+        Visited order[few_leaves];
+        std::size_t ordered = 0;
+        if (!dense) visiting_order(few, leaf, 0, 0.0, order, ordered);
         double by_lists = 0.0, terms[leaf_size];
         unsigned open = 0;
         for (std::size_t v = 0; v < query_vectors; ++v) {
@@ -232,10 +244,10 @@ static double few_nearest(const CompactPosterior& posterior, std::uint32_t neigh
             // A list that ends within the resolution settles nothing.
             if (!dense && (used & bits_of(within < static_cast<double>(few_list))) != 0) {
                 Lanes best[few_list];
-                sort_nearest(distances, order, ordered, best);
+                sort_nearest(distances, order, ordered, used, best);
                 const auto weight_of = [&](std::size_t number) HOLDFAST_LAMBDA {
                     return posterior
-                        .weights[order[number / leaf_size] * leaf_size + number % leaf_size];
+                        .weights[order[number / leaf_size].leaf * leaf_size + number % leaf_size];
                 };
                 unsettled =
                     walk_single<few_list>(best, __builtin_inf(), v * lane_count, weight_of, weight,

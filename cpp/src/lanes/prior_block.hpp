@@ -327,6 +327,31 @@ HOLDFAST_INLINE void put_gain(const PriorGroup& group, PriorPlaces& places, std:
     store(gains + (n * group.vectors + vector) * lane_count, own * log_of(ratio));
 }
 
+/// Finds the places of the points that have no equal, by the number of their neighbours: sums
+/// beside each other should end together. Returns how many there are.
+static std::size_t order_singles(const PriorPlaces& places, std::size_t count,
+                                 std::size_t* singles) {
+    // Without a branch on a number: the rank of each is how many come before it.
+    std::uint32_t keys[prior_block_size], ranks[prior_block_size] = {};
+    std::size_t found = 0;
+    for (std::size_t place = 0; place < count; ++place) {
+        const std::size_t end = places.end_of_equals[place];
+        const bool single =
+            end == place + 1 && (place == 0 || places.end_of_equals[place - 1] == place);
+        const std::size_t key = places.around[place].members * prior_block_size + place;
+        keys[place] = single ? static_cast<std::uint32_t>(key) : 0xffffffffu;
+        found += single ? 1 : 0;
+    }
+    for (std::size_t place = count; place < prior_block_size; ++place) keys[place] = 0xffffffffu;
+    for (const std::uint32_t other : keys) {
+        for (std::size_t i = 0; i < prior_block_size; ++i) ranks[i] += other < keys[i] ? 1 : 0;
+    }
+    for (std::size_t place = 0; place < count; ++place) {
+        if (keys[place] != 0xffffffffu) singles[ranks[place]] = place;
+    }
+    return found;
+}
+
 /// For the points at [begin, end) of the group's order, `prior_block_size` or fewer: terms[n] of
 /// the prior's entropy, gains[n][vectors * 8] of the posteriors' information. `doubles` has
 /// 10 stride + 9 k places, `all_numbers` prior_block_size (stride + 16).
@@ -343,21 +368,8 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
         places.end_of_equals[0] = 1;
         places.inverse_masses[0] = 1.0;
     }
-    // Those that have no equal, by the number of their neighbours: sums beside each other should
-    // end together.
-    std::size_t singles[prior_block_size], num_singles = 0;
-    for (std::size_t place = 0; place < count; ++place) {
-        if (places.end_of_equals[place] != place + 1 ||
-            (place > 0 && places.end_of_equals[place - 1] == place + 1)) {
-            continue;
-        }
-        std::size_t at = num_singles++;
-        const std::size_t members = places.around[place].members;
-        for (; at > 0 && places.around[singles[at - 1]].members > members; --at) {
-            singles[at] = singles[at - 1];
-        }
-        singles[at] = place;
-    }
+    std::size_t singles[prior_block_size];
+    const std::size_t num_singles = order_singles(places, count, singles);
     for (std::size_t v = 0; v < group.vectors; ++v) {
         // One vector of posteriors after the other: its rows stay in the first cache.
         const double* const rows = group.weights + v * group.count * lane_count;
@@ -406,9 +418,10 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
                 const std::size_t place = chosen[first + (i < here ? i : here - 1)];
                 numbers[i] = places.numbers[place];
                 members[i] = places.around[place].members;
-                sums[i] = Lanes{};
             }
-            sum_rows(rows, numbers, members, sums);
+            Lanes totals[sums_together] = {};
+            sum_rows(rows, numbers, members, totals);
+            for (std::size_t i = 0; i < sums_together; ++i) sums[i] = totals[i];
             for (std::size_t i = 0; i < here; ++i) {
                 put_gain(group, places, chosen[first + i], v, rows, sums[i], gains);
             }
