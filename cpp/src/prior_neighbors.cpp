@@ -121,11 +121,22 @@ Lined rows_of(const std::vector<std::uint32_t>& present, const double* prior, co
               std::size_t count, std::size_t number, std::size_t vectors) {
     const std::size_t size = present.size();
     Lined rows(size * vectors * lane_count);
-    for (std::size_t column = 0; column < vectors * lane_count; ++column) {
-        const double* const own = column == 0 ? prior : weights + (column - 1) * count;
-        double* const to = &rows[column / lane_count * size * lane_count + column % lane_count];
+    const std::vector<double> nothing(count);
+    for (std::size_t v = 0; v < vectors; ++v) {
+        const double* columns[lane_count];
+        for (std::size_t lane = 0; lane < lane_count; ++lane) {
+            const std::size_t column = v * lane_count + lane;
+            columns[lane] = column == 0        ? prior
+                            : column <= number ? weights + (column - 1) * count
+                                               : nothing.data();
+        }
+        // Row by row: column by column a vector's rows would go through the first cache eight
+        // times.
+        double* const to = rows.data() + v * size * lane_count;
         for (std::size_t i = 0; i < size; ++i) {
-            to[i * lane_count] = column <= number ? own[present[i]] : 0.0;
+            for (std::size_t lane = 0; lane < lane_count; ++lane) {
+                to[i * lane_count + lane] = columns[lane][present[i]];
+            }
         }
     }
     return rows;
