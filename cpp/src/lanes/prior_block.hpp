@@ -311,10 +311,57 @@ static void find_neighborhoods(const PriorGroup& group, std::size_t count, doubl
     }
 }
 
-/// The gain of a point under eight posteriors.
-HOLDFAST_INLINE void put_gain(const PriorGroup& group, PriorPlaces& places, std::size_t place,
-                              std::size_t vector, const double* rows, const Lanes& sum,
-                              double* gains) {
+/// Points under posteriors that give them weight, one after the other: most lanes of a row have
+/// none, and a logarithm takes as long for one lane as for eight.
+struct PendingGains {
+    static constexpr std::size_t room = (prior_block_size + 1) * lane_count;
+    std::size_t number = 0;
+    double sums[room], weights[room], inverse_masses[room];
+    std::uint32_t places[room];  // in the gains
+
+    HOLDFAST_INLINE void add(const Lanes& sum, const Lanes& own, double inverse_mass,
+                             std::size_t place) {
+        unsigned bits = bits_of(own > 0.0);
+        store(inverse_masses + number, splat(inverse_mass));
+#if defined(__AVX512VL__)
+        const auto mask = static_cast<__mmask8>(bits);
+        _mm512_storeu_pd(sums + number, _mm512_maskz_compress_pd(mask, sum.part[0]));
+        _mm512_storeu_pd(weights + number, _mm512_maskz_compress_pd(mask, own.part[0]));
+        const __m256i lanes = _mm256_add_epi32(_mm256_set1_epi32(static_cast<int>(place)),
+                                               _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
+        _mm256_storeu_si256(reinterpret_cast<__m256i*>(places + number),
+                            _mm256_maskz_compress_epi32(mask, lanes));
+        number += static_cast<std::size_t>(__builtin_popcount(bits));
+#else
+        for (; bits != 0; bits &= bits - 1) {
+            const auto lane = static_cast<std::size_t>(__builtin_ctz(bits));
+            sums[number] = sum[lane];
+            weights[number] = own[lane];
+            places[number++] = static_cast<std::uint32_t>(place + lane);
+        }
+#endif
+    }
+
+    void put(double* gains) {
+        store(sums + number, Lanes{});
+        store(weights + number, Lanes{});
+        store(inverse_masses + number, Lanes{});
+        for (std::size_t first = 0; first < number; first += lane_count) {
+            const Lanes own = load(weights + first);
+            const Lanes ratio = mass_around(load(sums + first), own) * load(inverse_masses + first);
+            double found[lane_count];
+            store(found, own * log_of(ratio));
+            const std::size_t left = number - first < lane_count ? number - first : lane_count;
+            for (std::size_t i = 0; i < left; ++i) gains[places[first + i]] = found[i];
+        }
+        number = 0;
+    }
+};
+
+/// Takes down what a point gains under eight posteriors.
+HOLDFAST_INLINE void take_gain(const PriorGroup& group, PriorPlaces& places, std::size_t place,
+                               std::size_t vector, const double* rows, const Lanes& sum,
+                               PendingGains& pending) {
     const std::size_t n = places.points[place];
     const Lanes own = load(rows + n * lane_count);
     if (vector == 0 && group.neighbors > 0) {  // its first column is the prior
@@ -322,9 +369,7 @@ HOLDFAST_INLINE void put_gain(const PriorGroup& group, PriorPlaces& places, std:
         places.masses[place / lane_count][place % lane_count] = sum[0];
         places.inverse_masses[place] = 1.0 / mass_around(sum[0], own[0]);
     }
-    const Lanes ratio =
-        select(own > 0.0, mass_around(sum, own) * places.inverse_masses[place], splat(1.0));
-    store(gains + (n * group.vectors + vector) * lane_count, own * log_of(ratio));
+    pending.add(sum, own, places.inverse_masses[place], (n * group.vectors + vector) * lane_count);
 }
 
 /// Finds the places of the points that have no equal, by the number of their neighbours: sums
@@ -368,6 +413,7 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
         places.end_of_equals[0] = 1;
         places.inverse_masses[0] = 1.0;
     }
+    PendingGains pending;
     std::size_t singles[prior_block_size];
     const std::size_t num_singles = order_singles(places, count, singles);
     for (std::size_t v = 0; v < group.vectors; ++v) {
@@ -375,9 +421,8 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
         const double* const rows = group.weights + v * group.count * lane_count;
         const auto has_weight = [&](std::size_t place) HOLDFAST_LAMBDA {
             const std::size_t n = places.points[place];
-            if (bits_of(load(rows + n * lane_count) > 0.0) != 0) return true;
             store(gains + (n * group.vectors + v) * lane_count, Lanes{});
-            return false;
+            return bits_of(load(rows + n * lane_count) > 0.0) != 0;
         };
         Lanes sums[sums_together];
         for (std::size_t place = 0; place < count;) {
@@ -401,7 +446,7 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
                 }
                 sum_ball(rows, numbers, members, own, begun, before, sums);
                 for (std::size_t i = 0; i < found; ++i) {
-                    put_gain(group, places, here[i], v, rows, sums[i], gains);
+                    take_gain(group, places, here[i], v, rows, sums[i], pending);
                 }
             }
         }
@@ -423,9 +468,10 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
             sum_rows(rows, numbers, members, totals);
             for (std::size_t i = 0; i < sums_together; ++i) sums[i] = totals[i];
             for (std::size_t i = 0; i < here; ++i) {
-                put_gain(group, places, chosen[first + i], v, rows, sums[i], gains);
+                take_gain(group, places, chosen[first + i], v, rows, sums[i], pending);
             }
         }
+        pending.put(gains);
     }
     for (std::size_t first = 0; group.neighbors > 0 && first < count; first += lane_count) {
         const std::size_t used = count - first < lane_count ? count - first : lane_count;
