@@ -21,7 +21,7 @@ constexpr double infinity = std::numeric_limits<double>::infinity();
 // The ways to an entropy and when which is taken. All give the same values up to rounding, and the
 // choice depends on counts alone, so the bits do not depend on threads or machines.
 //  - pair by pair: a posterior of few points, quadratic in them;
-//  - own tree: one posterior, a tree over its points;
+//  - own tree: one posterior, a tree over its points; of few points all pairs, added in its order;
 //  - grouped: posteriors that keep a good part of the points share one tree over all of them.
 // The costs are nanoseconds, measured in three dimensions; they need to be right within a factor of
 // two.
