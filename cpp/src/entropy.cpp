@@ -21,7 +21,7 @@ constexpr double infinity = std::numeric_limits<double>::infinity();
 // The ways to an entropy and when which is taken. All give the same values up to rounding, and the
 // choice depends on counts alone, so the bits do not depend on threads or machines.
 //  - pair by pair: a posterior of few points, quadratic in them;
-//  - own tree: one posterior, a tree over its points;
+//  - own tree: one posterior, a tree over its points; of few points all pairs, added in its order;
 //  - grouped: posteriors that keep a good part of the points share one tree over all of them.
 // The costs are nanoseconds, measured in three dimensions; they need to be right within a factor of
 // two.
@@ -102,17 +102,41 @@ double entropy_of_one(const Task& task) {
            static_cast<double>(task.dimension) * log(task.constants.resolution);
 }
 
-/// The surviving points of one posterior, coordinate by coordinate, for `compact_*`.
+/// Puts some points' numbers into the order of a tree over these points.
+void put_in_order_of_tree(const Task& task, std::vector<std::uint32_t>& numbers) {
+    std::vector<double> points(numbers.size() * task.dimension);
+    for (std::size_t i = 0; i < numbers.size(); ++i) {
+        const double* own = task.points + numbers[i] * task.dimension;
+        std::copy(own, own + task.dimension, points.begin() + i * task.dimension);
+    }
+    const PointTree tree(points.data(), numbers.size(), task.dimension);
+    const std::vector<std::uint32_t> before = numbers;
+    for (std::size_t i = 0; i < numbers.size(); ++i) numbers[i] = before[tree.order[i]];
+}
+
+/// Whether a posterior that has points of its own is one of `few_nearest`.
+bool are_few(const Task& task, std::size_t survivors) {
+    return survivors <= few_points && task.settings->neighbors <= 8 &&
+           task.settings->estimator == Estimator::nearest_neighbor;
+}
+
+/// The surviving points of one posterior, coordinate by coordinate, for `compact_*` and
+/// `few_nearest`.
 double compact_entropy(const Task& task, const double* weights, std::size_t survivors,
                        std::uint64_t& visits) {
-    const std::size_t stride = (survivors + lane_count - 1) / lane_count * lane_count;
+    const std::size_t stride = (survivors + leaf_size - 1) / leaf_size * leaf_size;
     thread_local std::vector<double> buffer;
     buffer.resize(stride * (task.dimension + 1) + lane_count * (stride + task.settings->neighbors));
     double* coordinates = buffer.data();
     double* compact_weights = coordinates + stride * task.dimension;
+    thread_local std::vector<std::uint32_t> kept;
+    kept.clear();
+    for (std::uint32_t n = 0; n < task.count; ++n) {
+        if (weights[n] != 0.0) kept.push_back(n);
+    }
+    if (survivors > unsorted_leaves * leaf_size) put_in_order_of_tree(task, kept);
     std::size_t at = 0;
-    for (std::size_t n = 0; n < task.count; ++n) {
-        if (weights[n] == 0.0) continue;
+    for (const std::uint32_t n : kept) {
         for (std::size_t c = 0; c < task.dimension; ++c) {
             coordinates[c * stride + at] = task.points[n * task.dimension + c];
         }
@@ -127,8 +151,9 @@ double compact_entropy(const Task& task, const double* weights, std::size_t surv
     if (task.settings->estimator == Estimator::gaussian_mixture) {
         return task.kernels->compact_mixture(posterior, task.settings->exponent, &visits);
     }
-    return task.kernels->compact_nearest(posterior, neighbors_among(task, survivors),
-                                         task.constants, &visits);
+    const auto nearest =
+        survivors > compact_limit ? task.kernels->few_nearest : task.kernels->compact_nearest;
+    return nearest(posterior, neighbors_among(task, survivors), task.constants, &visits);
 }
 
 /// Posteriors side by side over one tree; owns what PosteriorGroup points to.
@@ -404,7 +429,7 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
                          if (variance) {
                              values[at] = total_variance(task, w);
                              visits[at] = count;
-                         } else if (survivors[i] <= compact_limit) {
+                         } else if (survivors[i] <= compact_limit || are_few(task, survivors[i])) {
                              values[at] = settings.offset +
                                           compact_entropy(task, w, survivors[i], visits[at]);
                          } else {

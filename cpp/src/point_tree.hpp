@@ -15,6 +15,9 @@
 namespace holdfast {
 
 inline constexpr std::size_t leaf_size = 16;
+/// A tree of no more leaves has the points in their own order: among so few everything is near
+/// everything.
+inline constexpr std::size_t unsorted_leaves = 4;
 inline constexpr std::size_t max_dimension = 64;
 inline constexpr std::uint32_t no_point = 0xffffffffu;
 
@@ -58,6 +61,9 @@ class PointTree {
     std::vector<double> low, high;
 
   private:
+    std::vector<double> keys_;
+    std::vector<std::uint32_t> rest_;
+
     std::uint32_t build(const double* points, std::uint32_t first_leaf, std::uint32_t last_leaf);
 };
 

@@ -5,6 +5,7 @@
 #include <limits>
 #include <memory>
 #include <numeric>
+#include <optional>
 #include <utility>
 #include <vector>
 
@@ -116,19 +117,24 @@ void Coordinates::bring_together_equals(std::size_t size, std::size_t stride) {
     for (std::uint32_t n = 0; n < size; ++n) order[begins[class_of[n]]++] = n;
 }
 
-/// Eight after eight, the prior and the posteriors beside each other, point by point.
-Lined rows_of(const std::vector<std::uint32_t>& present, const double* prior, const double* weights,
-              std::size_t count, std::size_t number, std::size_t vectors) {
-    const std::size_t size = present.size();
-    Lined rows(size * vectors * lane_count);
-    for (std::size_t column = 0; column < vectors * lane_count; ++column) {
-        const double* const own = column == 0 ? prior : weights + (column - 1) * count;
-        double* const to = &rows[column / lane_count * size * lane_count + column % lane_count];
-        for (std::size_t i = 0; i < size; ++i) {
-            to[i * lane_count] = column <= number ? own[present[i]] : 0.0;
+/// Writes the rows of a vector: of eight posteriors, of which the first of all is the prior.
+void write_rows(const std::vector<std::uint32_t>& present, const double* prior,
+                const double* weights, std::size_t count, std::size_t number, std::size_t vector,
+                double* to) {
+    const std::vector<double> nothing(count);
+    const double* columns[lane_count];
+    for (std::size_t lane = 0; lane < lane_count; ++lane) {
+        const std::size_t column = vector * lane_count + lane;
+        columns[lane] = column == 0        ? prior
+                        : column <= number ? weights + (column - 1) * count
+                                           : nothing.data();
+    }
+    // Row by row: column by column they would go through the first cache eight times.
+    for (std::size_t i = 0; i < present.size(); ++i) {
+        for (std::size_t lane = 0; lane < lane_count; ++lane) {
+            to[i * lane_count + lane] = columns[lane][present[i]];
         }
     }
-    return rows;
 }
 
 }  // namespace
@@ -151,19 +157,28 @@ void prior_entropies(const PointSets& sets, const double* weights, std::size_t n
         const std::size_t vectors = (1 + here + lane_count - 1) / lane_count;
         const std::size_t columns = vectors * lane_count;
         const double* own = weights + first * sets.count;
-        const Lined rows = rows_of(present, settings.prior, own, sets.count, here, vectors);
         const std::size_t together =
             std::clamp<std::size_t>(most_gains / (size * columns), 1, sets.number);
-        Lined gains(together * size * columns), terms(together * size);
+        Lined rows(size * columns), gains(together * size * columns), terms(together * size);
         for (std::size_t from = 0; from < sets.number; from += together) {
             const std::size_t of_sets = std::min(together, sets.number - from);
-            std::vector<Coordinates> coordinates;
-            for (std::size_t h = 0; h < of_sets; ++h) {
-                coordinates.emplace_back(sets, from + h, present, stride);
-            }
             const double work =
                 static_cast<double>(of_sets * size) * (cost_of_a_pair * static_cast<double>(size) +
                                                        cost_of_sums * static_cast<double>(vectors));
+            // Helpers that wait while one thread prepares may go to sleep.
+            std::vector<std::optional<Coordinates>> coordinates(of_sets);
+            const std::size_t to_write = from == 0 ? vectors : 0;
+            parallel_for(of_sets + to_write,
+                         threads_for(work, of_sets + to_write, settings.threads),
+                         [&](std::size_t i) {
+                             if (i < of_sets) {
+                                 coordinates[i].emplace(sets, from + i, present, stride);
+                                 return;
+                             }
+                             const std::size_t v = i - of_sets;
+                             write_rows(present, settings.prior, own, sets.count, here, v,
+                                        rows.data() + v * size * lane_count);
+                         });
             const std::size_t pieces = of_sets * blocks;
             parallel_for(pieces, threads_for(work, pieces, settings.threads), [&](std::size_t i) {
                 const std::size_t h = i / blocks, begin = i % blocks * prior_block_size;
@@ -172,8 +187,8 @@ void prior_entropies(const PointSets& sets, const double* weights, std::size_t n
                 scratch.resize(10 * stride + 9 * k);
                 numbers.resize(prior_block_size * (stride + 2 * lane_count));
                 vector_kernels().prior_block(
-                    {size, stride, sets.dimension, coordinates[h].varying,
-                     coordinates[h].values.data(), coordinates[h].order.data(), vectors,
+                    {size, stride, sets.dimension, coordinates[h]->varying,
+                     coordinates[h]->values.data(), coordinates[h]->order.data(), vectors,
                      rows.data(), k, constants},
                     begin, std::min(begin + prior_block_size, size), scratch.data(), numbers.data(),
                     &terms[h * size], &gains[h * size * columns]);

@@ -63,6 +63,9 @@ struct CompactPosterior {
     double* scratch;  // [stride + the k of the nearest neighbours][8]
 };
 
+/// The most points of few_nearest.
+inline constexpr std::size_t few_points = 8 * leaf_size;
+
 /// Points of a prior that are worked on together.
 inline constexpr std::size_t prior_block_size = 32;
 
@@ -124,6 +127,10 @@ struct VectorKernels {
                              double* weights);
     double (*compact_nearest)(const CompactPosterior&, std::uint32_t neighbors,
                               const NearestNeighborConstants&, std::uint64_t* visits);
+    /// The same for up to few_points points and eight neighbours, added as over a tree of their
+    /// own; the stride is a multiple of leaf_size.
+    double (*few_nearest)(const CompactPosterior&, std::uint32_t neighbors,
+                          const NearestNeighborConstants&, std::uint64_t* visits);
     double (*compact_mixture)(const CompactPosterior&, double exponent, std::uint64_t* visits);
     /// Adds the terms of the points of one leaf: out[vectors * 8].
     /// `scratch` holds as many doubles as the largest k.

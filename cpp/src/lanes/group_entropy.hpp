@@ -22,13 +22,14 @@ static void group_nearest_rows(const PosteriorGroup& group, const QueryLeaf& que
     const double resolution_squared = constants.resolution * constants.resolution * tie_tolerance;
     double unused, diameter_squared;
     box_distances(group.tree, query.node, query.node, unused, diameter_squared);
-    const bool dense = diameter_squared <= resolution_squared;
+    bool dense = diameter_squared <= resolution_squared;
     bool summed = false;
     Row<vectors> rows[leaf_size];
     NearestLists<length> lists;
     Lanes wanted[vectors];  // the k of each column
+    // Where all lists would end within the resolution, all points need their balls.
+    dense = dense || !find_nearest(group.tree, query, lists, visits, resolution_squared);
     if (!dense) {
-        find_nearest(group.tree, query, lists, visits);
         for (std::size_t v = 0; v < vectors; ++v) {
             for (std::size_t lane = 0; lane < lane_count; ++lane) {
                 wanted[v][lane] = group.neighbors[v * lane_count + lane];

@@ -249,34 +249,30 @@ static void walk_outwards(const PosteriorGroup& group, const QueryLeaf& query, s
     }
 }
 
-/// The terms of a leaf's points under a single posterior: eight points side by side instead of
-/// eight posteriors. Adds what the lists settle to `sum`, and tells by bits which points they do
-/// not.
-template <std::size_t length>
-static unsigned walk_single(const PosteriorGroup& group, const QueryLeaf& query, std::size_t v,
-                            const NearestLists<length>& lists,
-                            const NearestNeighborConstants& constants, double& sum) {
-    const TreeView& tree = group.tree;
+/// The terms of eight points under a single posterior, side by side instead of eight posteriors.
+/// Adds what their sorted lists settle to `sum`, and tells by bits which points they do not. A
+/// point's own number is `first` and its lane.
+template <std::size_t length, class WeightOf>
+HOLDFAST_INLINE unsigned walk_single(const Lanes* keys, double complete_below, std::size_t first,
+                                     const WeightOf& weight_of, const Lanes& own_weight,
+                                     std::uint32_t neighbors, std::size_t dimension,
+                                     const NearestNeighborConstants& constants, double& sum) {
     const double resolution_squared = constants.resolution * constants.resolution * tie_tolerance;
-    const std::uint32_t neighbors = group.neighbors[0];
-    const Lanes last =
-        detail::from_bits<Lanes>(detail::bits(lists.keys[v][length - 1]) & ~number_bits);
-    const Lanes limit = select(last < lists.complete_below, last, splat(lists.complete_below));
+    const Lanes last = detail::from_bits<Lanes>(detail::bits(keys[length - 1]) & ~number_bits);
+    const Lanes limit = select(last < complete_below, last, splat(complete_below));
     Lanes mass{}, within{}, radius = splat(__builtin_inf());
     for (std::size_t rank = 0; rank < length; ++rank) {
-        const Lanes key = lists.keys[v][rank];
+        const Lanes key = keys[rank];
         const IntLanes known = key < limit;
         const Lanes distance = detail::from_bits<Lanes>(detail::bits(key) & ~number_bits);
+        if (bits_of(known & (distance <= radius)) == 0) break;
         Lanes weight{};
         const unsigned bits = bits_of(known);
         for (std::size_t lane = 0; lane < lane_count; ++lane) {
             if ((bits >> lane & 1) == 0) continue;
             const auto number = static_cast<std::size_t>(detail::bits(key[lane]) & number_bits);
-            // The own leaf is the first one visited, so a point's own number is its place in it.
-            if (number == v * lane_count + lane) continue;
-            weight[lane] = group.weights[lists.slots[number] * lane_count];
+            if (number != first + lane) weight[lane] = weight_of(number);
         }
-        if (bits_of(known & (distance <= radius)) == 0) break;
         const IntLanes open = (distance <= radius) & (weight > 0.0);
         mass += select(open, weight, Lanes{});
         within += select(open, splat(1.0), Lanes{});
@@ -286,21 +282,32 @@ static unsigned walk_single(const PosteriorGroup& group, const QueryLeaf& query,
                                   splat(resolution_squared));
         radius = select(reached, wide, radius);
     }
-    Lanes weight{};
-    for (std::size_t lane = 0; lane < lane_count; ++lane) {
-        weight[lane] = group.weights[(query.first_slot + v * lane_count + lane) * lane_count];
-    }
-    const unsigned settled = bits_of((radius < limit) & (weight > 0.0));
-    const Lanes spread = 0.5 * static_cast<double>(tree.dimension) * log_of(radius) -
-                         log_of(mass / (1.0 - weight)) + constants.log_ball_volume;
+    const unsigned settled = bits_of((radius < limit) & (own_weight > 0.0));
+    const Lanes spread = 0.5 * static_cast<double>(dimension) * log_of(radius) -
+                         log_of(mass / (1.0 - own_weight)) + constants.log_ball_volume;
     for (std::size_t lane = 0; lane < lane_count; ++lane) {
         if ((settled >> lane & 1) == 0) continue;
         const std::uint32_t q = radius[lane] > resolution_squared
                                     ? neighbors
                                     : static_cast<std::uint32_t>(within[lane]);
-        sum += weight[lane] * (spread[lane] + constants.bias_correction[q]);
+        sum += own_weight[lane] * (spread[lane] + constants.bias_correction[q]);
     }
-    return bits_of(weight > 0.0) & ~settled;
+    return bits_of(own_weight > 0.0) & ~settled;
+}
+
+/// Of eight points of a leaf, whose own leaf was the first one visited.
+template <std::size_t length>
+static unsigned walk_single(const PosteriorGroup& group, const QueryLeaf& query, std::size_t v,
+                            const NearestLists<length>& lists,
+                            const NearestNeighborConstants& constants, double& sum) {
+    const double* const own = group.weights + (query.first_slot + v * lane_count) * lane_count;
+    Lanes weight;
+    for (std::size_t lane = 0; lane < lane_count; ++lane) weight[lane] = own[lane * lane_count];
+    const auto weight_of = [&](std::size_t number) HOLDFAST_LAMBDA {
+        return group.weights[lists.slots[number] * lane_count];
+    };
+    return walk_single<length>(lists.keys[v], lists.complete_below, v * lane_count, weight_of,
+                               weight, group.neighbors[0], group.tree.dimension, constants, sum);
 }
 
 }  // namespace holdfast::inline HOLDFAST_ISA

@@ -193,26 +193,17 @@ static void neighborhoods_of(const PriorGroup& group, const std::uint32_t* point
 /// Points whose sums are made beside each other, so that no addition waits for the one before.
 inline constexpr std::size_t sums_together = registers == 1 ? 4 : 2;
 
-/// sums[i] = the sum over the i-th point's numbers, in their order, of eight posteriors' rows.
-template <std::size_t points>
+/// totals[p] += the rows of eight posteriors at the p-th point's numbers from the i-th on, in their
+/// order. The numbers of members do not fall.
+template <std::size_t first = 0>
 HOLDFAST_INLINE void sum_rows(const double* rows, const std::uint32_t* const* numbers,
-                              const std::size_t* members, Lanes* sums) {
-    std::size_t shortest = members[0];
-    for (std::size_t p = 1; p < points; ++p) {
-        if (members[p] < shortest) shortest = members[p];
-    }
-    Lanes totals[points] = {};
-    for (std::size_t i = 0; i < shortest; ++i) {
-        for (std::size_t p = 0; p < points; ++p) {
+                              const std::size_t* members, Lanes* totals, std::size_t i = 0) {
+    for (; i < members[first]; ++i) {
+        for (std::size_t p = first; p < sums_together; ++p) {
             totals[p] += load(rows + numbers[p][i] * lane_count);
         }
     }
-    for (std::size_t p = 0; p < points; ++p) {
-        for (std::size_t i = shortest; i < members[p]; ++i) {
-            totals[p] += load(rows + numbers[p][i] * lane_count);
-        }
-        sums[p] = totals[p];
-    }
+    if constexpr (first + 1 < sums_together) sum_rows<first + 1>(rows, numbers, members, totals, i);
 }
 
 /// The sums of equal points, which have one ball: sums[i] lacks the own[i]-th of its numbers. Own
@@ -320,10 +311,57 @@ static void find_neighborhoods(const PriorGroup& group, std::size_t count, doubl
     }
 }
 
-/// The gain of a point under eight posteriors.
-HOLDFAST_INLINE void put_gain(const PriorGroup& group, PriorPlaces& places, std::size_t place,
-                              std::size_t vector, const double* rows, const Lanes& sum,
-                              double* gains) {
+/// Points under posteriors that give them weight, one after the other: most lanes of a row have
+/// none, and a logarithm takes as long for one lane as for eight.
+struct PendingGains {
+    static constexpr std::size_t room = (prior_block_size + 1) * lane_count;
+    std::size_t number = 0;
+    double sums[room], weights[room], inverse_masses[room];
+    std::uint32_t places[room];  // in the gains
+
+    HOLDFAST_INLINE void add(const Lanes& sum, const Lanes& own, double inverse_mass,
+                             std::size_t place) {
+        unsigned bits = bits_of(own > 0.0);
+        store(inverse_masses + number, splat(inverse_mass));
+#if defined(__AVX512VL__)
+        const auto mask = static_cast<__mmask8>(bits);
+        _mm512_storeu_pd(sums + number, _mm512_maskz_compress_pd(mask, sum.part[0]));
+        _mm512_storeu_pd(weights + number, _mm512_maskz_compress_pd(mask, own.part[0]));
+        const __m256i lanes = _mm256_add_epi32(_mm256_set1_epi32(static_cast<int>(place)),
+                                               _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
+        _mm256_storeu_si256(reinterpret_cast<__m256i*>(places + number),
+                            _mm256_maskz_compress_epi32(mask, lanes));
+        number += static_cast<std::size_t>(__builtin_popcount(bits));
+#else
+        for (; bits != 0; bits &= bits - 1) {
+            const auto lane = static_cast<std::size_t>(__builtin_ctz(bits));
+            sums[number] = sum[lane];
+            weights[number] = own[lane];
+            places[number++] = static_cast<std::uint32_t>(place + lane);
+        }
+#endif
+    }
+
+    void put(double* gains) {
+        store(sums + number, Lanes{});
+        store(weights + number, Lanes{});
+        store(inverse_masses + number, Lanes{});
+        for (std::size_t first = 0; first < number; first += lane_count) {
+            const Lanes own = load(weights + first);
+            const Lanes ratio = mass_around(load(sums + first), own) * load(inverse_masses + first);
+            double found[lane_count];
+            store(found, own * log_of(ratio));
+            const std::size_t left = number - first < lane_count ? number - first : lane_count;
+            for (std::size_t i = 0; i < left; ++i) gains[places[first + i]] = found[i];
+        }
+        number = 0;
+    }
+};
+
+/// Takes down what a point gains under eight posteriors.
+HOLDFAST_INLINE void take_gain(const PriorGroup& group, PriorPlaces& places, std::size_t place,
+                               std::size_t vector, const double* rows, const Lanes& sum,
+                               PendingGains& pending) {
     const std::size_t n = places.points[place];
     const Lanes own = load(rows + n * lane_count);
     if (vector == 0 && group.neighbors > 0) {  // its first column is the prior
@@ -331,9 +369,32 @@ HOLDFAST_INLINE void put_gain(const PriorGroup& group, PriorPlaces& places, std:
         places.masses[place / lane_count][place % lane_count] = sum[0];
         places.inverse_masses[place] = 1.0 / mass_around(sum[0], own[0]);
     }
-    const Lanes ratio =
-        select(own > 0.0, mass_around(sum, own) * places.inverse_masses[place], splat(1.0));
-    store(gains + (n * group.vectors + vector) * lane_count, own * log_of(ratio));
+    pending.add(sum, own, places.inverse_masses[place], (n * group.vectors + vector) * lane_count);
+}
+
+/// Finds the places of the points that have no equal, by the number of their neighbours: sums
+/// beside each other should end together. Returns how many there are.
+static std::size_t order_singles(const PriorPlaces& places, std::size_t count,
+                                 std::size_t* singles) {
+    // Without a branch on a number: the rank of each is how many come before it.
+    std::uint32_t keys[prior_block_size], ranks[prior_block_size] = {};
+    std::size_t found = 0;
+    for (std::size_t place = 0; place < count; ++place) {
+        const std::size_t end = places.end_of_equals[place];
+        const bool single =
+            end == place + 1 && (place == 0 || places.end_of_equals[place - 1] == place);
+        const std::size_t key = places.around[place].members * prior_block_size + place;
+        keys[place] = single ? static_cast<std::uint32_t>(key) : 0xffffffffu;
+        found += single ? 1 : 0;
+    }
+    for (std::size_t place = count; place < prior_block_size; ++place) keys[place] = 0xffffffffu;
+    for (const std::uint32_t other : keys) {
+        for (std::size_t i = 0; i < prior_block_size; ++i) ranks[i] += other < keys[i] ? 1 : 0;
+    }
+    for (std::size_t place = 0; place < count; ++place) {
+        if (keys[place] != 0xffffffffu) singles[ranks[place]] = place;
+    }
+    return found;
 }
 
 /// For the points at [begin, end) of the group's order, `prior_block_size` or fewer: terms[n] of
@@ -352,21 +413,21 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
         places.end_of_equals[0] = 1;
         places.inverse_masses[0] = 1.0;
     }
+    PendingGains pending;
+    std::size_t singles[prior_block_size];
+    const std::size_t num_singles = order_singles(places, count, singles);
     for (std::size_t v = 0; v < group.vectors; ++v) {
         // One vector of posteriors after the other: its rows stay in the first cache.
         const double* const rows = group.weights + v * group.count * lane_count;
         const auto has_weight = [&](std::size_t place) HOLDFAST_LAMBDA {
             const std::size_t n = places.points[place];
-            if (bits_of(load(rows + n * lane_count) > 0.0) != 0) return true;
             store(gains + (n * group.vectors + v) * lane_count, Lanes{});
-            return false;
+            return bits_of(load(rows + n * lane_count) > 0.0) != 0;
         };
-        std::size_t chosen[prior_block_size], single = 0;
         Lanes sums[sums_together];
         for (std::size_t place = 0; place < count;) {
             const std::size_t end_of_equals = places.end_of_equals[place];
             if (end_of_equals - place == 1) {
-                if (has_weight(place)) chosen[single++] = place;
                 ++place;
                 continue;
             }
@@ -385,30 +446,32 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
                 }
                 sum_ball(rows, numbers, members, own, begun, before, sums);
                 for (std::size_t i = 0; i < found; ++i) {
-                    put_gain(group, places, here[i], v, rows, sums[i], gains);
+                    take_gain(group, places, here[i], v, rows, sums[i], pending);
                 }
             }
         }
-        for (std::size_t first = 0; first < single; first += sums_together) {
+        std::size_t chosen[prior_block_size], number = 0;
+        for (std::size_t s = 0; s < num_singles; ++s) {
+            if (has_weight(singles[s])) chosen[number++] = singles[s];
+        }
+        for (std::size_t first = 0; first < number; first += sums_together) {
             const std::size_t here =
-                single - first < sums_together ? single - first : sums_together;
+                number - first < sums_together ? number - first : sums_together;
             const std::uint32_t* numbers[sums_together];
             std::size_t members[sums_together];
-            for (std::size_t i = 0; i < here; ++i) {
-                numbers[i] = places.numbers[chosen[first + i]];
-                members[i] = places.around[chosen[first + i]].members;
+            for (std::size_t i = 0; i < sums_together; ++i) {
+                const std::size_t place = chosen[first + (i < here ? i : here - 1)];
+                numbers[i] = places.numbers[place];
+                members[i] = places.around[place].members;
             }
-            if (here == sums_together) {
-                sum_rows<sums_together>(rows, numbers, members, sums);
-            } else {
-                for (std::size_t i = 0; i < here; ++i) {
-                    sum_rows<1>(rows, numbers + i, members + i, sums + i);
-                }
-            }
+            Lanes totals[sums_together] = {};
+            sum_rows(rows, numbers, members, totals);
+            for (std::size_t i = 0; i < sums_together; ++i) sums[i] = totals[i];
             for (std::size_t i = 0; i < here; ++i) {
-                put_gain(group, places, chosen[first + i], v, rows, sums[i], gains);
+                take_gain(group, places, chosen[first + i], v, rows, sums[i], pending);
             }
         }
+        pending.put(gains);
     }
     for (std::size_t first = 0; group.neighbors > 0 && first < count; first += lane_count) {
         const std::size_t used = count - first < lane_count ? count - first : lane_count;

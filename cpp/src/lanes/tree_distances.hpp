@@ -13,24 +13,29 @@ namespace holdfast::inline HOLDFAST_ISA {
 
 inline constexpr std::size_t stack_size = 128;  // deeper than any balanced tree of 2^32 points
 
-/// Least and greatest squared distance between the boxes of two nodes.
-HOLDFAST_INLINE void box_distances(const TreeView& tree, std::size_t a, std::size_t b,
-                                   double& least, double& greatest) {
+/// Least and greatest squared distance between two boxes.
+HOLDFAST_INLINE void box_distances(std::size_t dimension, const double* a_low, const double* a_high,
+                                   const double* b_low, const double* b_high, double& least,
+                                   double& greatest) {
     least = 0.0;
     greatest = 0.0;
-    for (std::size_t c = 0; c < tree.dimension; ++c) {
-        const double a_low = tree.low[a * tree.dimension + c],
-                     a_high = tree.high[a * tree.dimension + c];
-        const double b_low = tree.low[b * tree.dimension + c],
-                     b_high = tree.high[b * tree.dimension + c];
-        const double gap_1 = b_low - a_high, gap_2 = a_low - b_high;
+    for (std::size_t c = 0; c < dimension; ++c) {
+        const double gap_1 = b_low[c] - a_high[c], gap_2 = a_low[c] - b_high[c];
         double gap = gap_1 > gap_2 ? gap_1 : gap_2;
         if (gap < 0.0) gap = 0.0;
-        const double span_1 = b_high - a_low, span_2 = a_high - b_low;
+        const double span_1 = b_high[c] - a_low[c], span_2 = a_high[c] - b_low[c];
         const double span = span_1 > span_2 ? span_1 : span_2;
         least += gap * gap;
         greatest += span * span;
     }
+}
+
+/// Those between the boxes of two nodes.
+HOLDFAST_INLINE void box_distances(const TreeView& tree, std::size_t a, std::size_t b,
+                                   double& least, double& greatest) {
+    const std::size_t own = a * tree.dimension, other = b * tree.dimension;
+    box_distances(tree.dimension, tree.low + own, tree.high + own, tree.low + other,
+                  tree.high + other, least, greatest);
 }
 
 /// The same from one point to the box of a node; only the least distance is wanted.
@@ -51,23 +56,28 @@ inline constexpr std::size_t query_vectors = leaf_size / lane_count;
 /// Least and greatest squared distance from eight points of a leaf to the box of a node.
 struct PointDistances {
     Lanes least, greatest;
+
+    /// Adds a coordinate, in which the box lies between two numbers.
+    HOLDFAST_INLINE void add(const Lanes& x, double low, double high) {
+        const Lanes from_low = x - low;
+        const Lanes to_high = high - x;
+        Lanes span = from_low, gap = -to_high;
+        const IntLanes upper = to_high > from_low;
+        span = select(upper, to_high, span);
+        gap = select(upper, -from_low, gap);
+        gap = select(gap > 0.0, gap, Lanes{});
+        least += gap * gap;
+        greatest += span * span;
+    }
 };
 
 HOLDFAST_INLINE PointDistances point_distances(const TreeView& tree, std::size_t leaf,
                                                std::size_t v, std::size_t node) {
     PointDistances result{};
     for (std::size_t c = 0; c < tree.dimension; ++c) {
-        const Lanes x =
-            load(tree.coordinates + (leaf * tree.dimension + c) * leaf_size + v * lane_count);
-        const Lanes from_low = x - tree.low[node * tree.dimension + c];
-        const Lanes to_high = tree.high[node * tree.dimension + c] - x;
-        Lanes span = from_low, gap = -to_high;
-        const IntLanes upper = to_high > from_low;
-        span = select(upper, to_high, span);
-        gap = select(upper, -from_low, gap);
-        gap = select(gap > 0.0, gap, Lanes{});
-        result.least += gap * gap;
-        result.greatest += span * span;
+        result.add(
+            load(tree.coordinates + (leaf * tree.dimension + c) * leaf_size + v * lane_count),
+            tree.low[node * tree.dimension + c], tree.high[node * tree.dimension + c]);
     }
     return result;
 }
