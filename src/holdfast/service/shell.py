@@ -34,8 +34,8 @@ from typing import Literal, TypeAlias
 import msgspec
 
 from holdfast.errors import DEFECT, MessageError, defect_fields
+from holdfast.protocol.effects import LogEvent
 from holdfast.protocol.messages import Busy, Refused, Request, decode_request, encode
-from holdfast.protocol.robot_events import LogEvent
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_batches import run_together
 from holdfast.protocol.service_jobs import (
