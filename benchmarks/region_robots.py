@@ -26,6 +26,7 @@ from holdfast.planning.settings import (
 from holdfast.planning.tracking import replay
 from holdfast.problems.problem import Problem
 from holdfast.protocol.dispatcher import Dispatcher
+from holdfast.protocol.effects import LogEvent
 from holdfast.protocol.messages import SessionConfiguration, decode_request
 from holdfast.protocol.robot import Robot
 from holdfast.protocol.robot_events import (
@@ -37,7 +38,6 @@ from holdfast.protocol.robot_events import (
     EnvironmentReady,
     Halt,
     Launch,
-    LogEvent,
     ReplyReceived,
     RobotEffect,
     Send,

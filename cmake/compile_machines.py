@@ -19,6 +19,7 @@ INTERPRETED = {
     "protocol/service_limits.py",
     # Nothing in them takes time.
     "protocol/__init__.py",
+    "protocol/effects.py",
     "protocol/robot_events.py",
     "protocol/status.py",
     "protocol/verification.py",

@@ -24,6 +24,7 @@ from holdfast.planning.settings import (
 from holdfast.planning.tracking import replay
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.dispatcher import Dispatcher
+from holdfast.protocol.effects import LogEvent
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
@@ -48,7 +49,6 @@ from holdfast.protocol.robot_events import (
     EnvironmentReady,
     Halt,
     Launch,
-    LogEvent,
     NoReading,
     OwnAnswer,
     Paused,

@@ -535,9 +535,9 @@ sys.exit(service_process.main(["--listen", "tcp/127.0.0.1:0", "--until-stdin-clo
     assert "numpy" in modules
     for heavy in (
         "cryptography", "holdfast.config.loader", "holdfast.config.user_code",
-        "holdfast.runtime.monitoring",
-        "importlib.metadata", "matplotlib", "multiprocessing", "numpy.ma", "prometheus_client",
-        "rich", "scipy", "sqlite3", "ssl", "yaml",
+        "holdfast.protocol.robot_events", "holdfast.runtime.monitoring", "importlib.metadata",
+        "matplotlib", "multiprocessing", "numpy.ma", "prometheus_client", "rich", "scipy",
+        "sqlite3", "ssl", "yaml",
     ):  # fmt: skip
         assert heavy not in modules
 

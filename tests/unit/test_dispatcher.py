@@ -6,10 +6,10 @@ import pytest
 from tests.robot_world import LOCAL, SmallService, World, answer_third_slowly, nth
 
 from holdfast.errors import ServiceRefusedError
+from holdfast.protocol.effects import LogEvent
 from holdfast.protocol.messages import Busy, Refused, Reply, Request, TaskAnswer, encode
 from holdfast.protocol.robot_events import (
     Launch,
-    LogEvent,
     RecoveryExited,
     Send,
     ServiceAppeared,

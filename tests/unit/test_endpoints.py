@@ -8,12 +8,7 @@ from pathlib import Path
 import pytest
 
 from holdfast.errors import TransportError
-from holdfast.transport.endpoints import (
-    Endpoint,
-    TlsFiles,
-    check_credentials,
-    parse_endpoint,
-)
+from holdfast.transport.endpoints import Endpoint, TlsFiles, check_credentials, parse_endpoint
 
 
 @pytest.mark.parametrize(

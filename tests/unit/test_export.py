@@ -548,18 +548,10 @@ MINE = ("--problem-directory", ".")
 class TestOwnCode:
     @pytest.mark.parametrize(
         ("pose", "positions"),
-        [
-            ("", None),
-            ('pose = ("z", None)', (0.0, 0.0, 1.0)),
-            ('pose = ("x",)', (1.0, 0.0, 0.0)),
-        ],
+        [("", None), ('pose = ("z", None)', (0.0, 0.0, 1.0)), ('pose = ("x",)', (1.0, 0.0, 0.0))],
     )
     def test_a_problem_says_its_pose_or_has_none(
-        self,
-        pose: str,
-        positions: tuple[float, float, float] | None,
-        place: Place,
-        tmp_path: Path,
+        self, pose: str, positions: tuple[float, float, float] | None, place: Place, tmp_path: Path
     ) -> None:
         (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", pose))
         place.run(PEG.replace("peg_in_hole_2d", "cart:Cart"))
@@ -581,10 +573,7 @@ class TestOwnCode:
             assert np.array_equal(found, states[:, :1] * np.array(positions))
 
     def test_code_that_a_record_names_is_not_run_unasked(
-        self,
-        place: Place,
-        monkeypatch: pytest.MonkeyPatch,
-        tmp_path: Path,
+        self, place: Place, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         """Wherever a module of that name lies: where it did, beside the journal, or here."""
         (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
@@ -743,11 +732,7 @@ class TestRefusals:
         ],
     )
     def test_options(
-        self,
-        options: tuple[str, ...],
-        message: str,
-        place: Place,
-        tmp_path: Path,
+        self, options: tuple[str, ...], message: str, place: Place, tmp_path: Path
     ) -> None:
         place.run(PEG)
         (tmp_path / "there").mkdir()
@@ -774,10 +759,7 @@ class TestRefusals:
         assert not (tmp_path / "tables").exists()
 
     def test_without_rosbags(
-        self,
-        place: Place,
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
+        self, place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         import sys
 
@@ -798,10 +780,7 @@ class TestNothingHalfWritten:
     """Neither at the places nor beside them; :func:`export` looks for the latter."""
 
     def test_interrupted(
-        self,
-        place: Place,
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
+        self, place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         from holdfast.reports.csv_export import CsvSink
 

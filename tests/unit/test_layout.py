@@ -31,6 +31,7 @@ WITHOUT_TESTS = {
     "errors": "types without behaviour",
     "master/__main__": "one line, which calls the command",
     "master/errors": "types without behaviour",
+    "protocol/effects": "two types; tests/unit/test_observation_warnings.py uses them",
     "protocol/robot_events": "types without behaviour",
     "reports/facts": "types without behaviour",
     "robot/health": "tests/processes/test_unattended.py asks it over HTTP",

@@ -18,8 +18,9 @@ from holdfast.planning.outcome import MoveResult, TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, OnLost, SimulatorSettings
 from holdfast.planning.tracking import Trial, replay
+from holdfast.protocol.effects import Effects, LogEvent
 from holdfast.protocol.observation_warnings import ObservationWarnings
-from holdfast.protocol.robot_events import Effects, Halt, LogEvent, RobotEffect, WriteRecords
+from holdfast.protocol.robot_events import Halt, RobotEffect, WriteRecords
 from holdfast.robot.environment import SimulatedEnvironment
 from holdfast.robot.trial import run_trial
 

@@ -18,6 +18,7 @@ from holdfast.planning.outcome import ending_of
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, OnLost, SimulatorSettings
 from holdfast.planning.tracking import Trial, replay
+from holdfast.protocol.effects import LogEvent
 from holdfast.protocol.messages import Reply, SensingAnswer, TaskAnswer
 from holdfast.protocol.question import OWN_PLANNER, InProcessSource
 from holdfast.protocol.robot import Robot
@@ -27,7 +28,6 @@ from holdfast.protocol.robot_events import (
     EnvironmentFailed,
     EnvironmentReady,
     Halt,
-    LogEvent,
     NoReading,
     RobotEffect,
     Timing,

@@ -43,6 +43,7 @@ from holdfast.planning.settings import (
 )
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.problem import Problem
+from holdfast.protocol.effects import LogEvent
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
@@ -58,7 +59,6 @@ from holdfast.protocol.messages import (
     decode_reply,
     encode,
 )
-from holdfast.protocol.robot_events import LogEvent
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
 from holdfast.protocol.service_limits import ServiceLimits

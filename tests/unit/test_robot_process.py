@@ -22,12 +22,12 @@ from holdfast.journal.run_directory import RunDirectory
 from holdfast.planning.inputs import Moved, PausedRecord, Sensed
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
+from holdfast.protocol.effects import LogEvent
 from holdfast.protocol.question import InProcessSource
 from holdfast.protocol.robot_events import (
     Act,
     Acted,
     ComputeOwnAnswer,
-    LogEvent,
     OwnAnswer,
     Paused,
     RecoveryExited,

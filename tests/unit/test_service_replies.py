@@ -6,8 +6,8 @@ import pytest
 from tests.unit.test_protocol_service import Robot
 
 from holdfast.protocol.computing_time import ExpectedTime
+from holdfast.protocol.effects import Effects
 from holdfast.protocol.messages import Busy, Progress, Refused, Reply, decode_reply
-from holdfast.protocol.robot_events import Effects
 from holdfast.protocol.service_jobs import EndCall, SendReply, ServiceEffect
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 from holdfast.protocol.service_replies import WaitingCalls

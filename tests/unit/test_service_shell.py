@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import gc
 import math
+import os
 import socket
 import threading
 from collections.abc import AsyncIterator, Callable
@@ -40,7 +41,14 @@ from holdfast.protocol.robot_events import (
     TransportEvent,
 )
 from holdfast.protocol.service import Service
-from holdfast.protocol.service_jobs import Job, JobResult, SendReply, ServiceEffect, StartJob
+from holdfast.protocol.service_jobs import (
+    EndCall,
+    Job,
+    JobResult,
+    SendReply,
+    ServiceEffect,
+    StartJob,
+)
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast.service import shell
 from holdfast.service.problem_factory import ProblemFactory
@@ -514,6 +522,26 @@ async def test_what_has_arrived_is_heard_before_the_next_brief_job() -> None:
         *("call 2 of a robot", "reply first", "begun two", "finished two"),
     ]
     assert set(threads) == {threading.current_thread()}
+
+
+@pytest.mark.parametrize("has_all", [False, True])
+async def test_a_core_is_yielded_only_to_a_robot_that_awaits_more(
+    has_all: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a robot's next question waits while other programs take this core."""
+    machine, both = scripted(("one", 1e-4, lambda: None))
+    reply = SendReply(1, b"a part")
+    answers = [[reply, EndCall(1)], machine.runs] if has_all else [[reply, *machine.runs]]
+    monkeypatch.setattr(machine, "receive", lambda *_: answers.pop(0))
+    yielded: list[int] = []
+    monkeypatch.setattr(os, "sched_yield", lambda: yielded.append(len(machine.trace)))
+    await both.start()
+    while answers:
+        both.deliver(Call(machine.trace))
+    while "finished one" not in machine.trace:
+        await asyncio.sleep(0)
+    assert yielded == ([] if has_all else [machine.trace.index("begun one")])
+    await both.close()
 
 
 async def test_jobs_that_cannot_be_computed_together_have_a_turn_each() -> None:

@@ -9,7 +9,8 @@ from holdfast.protocol.robot_events import (
     ServiceVanished,
     TransportEvent,
 )
-from holdfast.transport.calls import CallTable, too_large
+from holdfast.transport.calls import CallTable
+from holdfast.transport.contract import too_large
 
 
 def test_a_service_that_vanishes_ends_its_own_calls_after_that() -> None:

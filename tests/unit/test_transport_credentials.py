@@ -83,11 +83,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     home = top / "home"
     # Old enough for certificates that have expired already.
     make_credentials(
-        home,
-        robots=["expired_robot"],
-        services=["expired_service"],
-        days=30,
-        now=NOW - 100 * DAY,
+        home, robots=["expired_robot"], services=["expired_service"], days=30, now=NOW - 100 * DAY
     )
     make_credentials(
         home, robots=["future_robot"], services=["future_service"], now=NOW + 100 * DAY

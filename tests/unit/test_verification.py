@@ -14,14 +14,13 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.inputs import decode_floats, encode_floats
 from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.protocol.effects import Effects, LogEvent
 from holdfast.protocol.messages import Reply, SensingAnswer, TaskAnswer
 from holdfast.protocol.question import Provenance, Question, same_actions
 from holdfast.protocol.robot_events import (
     Act,
     ComputeOwnAnswer,
-    Effects,
     Halt,
-    LogEvent,
     OwnAnswer,
     RobotEffect,
     VerificationNoted,

@@ -14,7 +14,8 @@ from holdfast.planning.lost import MOVE, Verdict
 from holdfast.planning.settings import LostSettings, OnLost
 from holdfast.planning.tracking import Trial
 from holdfast.problems.attributes import sensing_labels
-from holdfast.protocol.robot_events import Effects, RobotEffect
+from holdfast.protocol.effects import Effects
+from holdfast.protocol.robot_events import RobotEffect
 
 _MAX_REPORTS = 10
 """Bound on reports of each kind per trial; all are counted."""

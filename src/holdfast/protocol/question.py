@@ -17,6 +17,7 @@ from holdfast.errors import HoldfastError, MessageError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.inputs import CatchUpInput, decode_floats
 from holdfast.planning.planner import Planner, PlanningState, encode_checkpoint
+from holdfast.protocol.effects import Effects
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_TASK_ACTIONS,
@@ -28,7 +29,6 @@ from holdfast.protocol.messages import (
 )
 from holdfast.protocol.robot_events import (
     ComputeOwnAnswer,
-    Effects,
     Halt,
     OwnAnswer,
     RecoveryExited,

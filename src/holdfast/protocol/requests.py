@@ -16,6 +16,7 @@ from collections.abc import Iterator
 
 from holdfast.errors import MessageError, StaleEpochError
 from holdfast.planning.planner import Planner
+from holdfast.protocol.effects import Effects
 from holdfast.protocol.messages import (
     Busy,
     NeedState,
@@ -30,7 +31,7 @@ from holdfast.protocol.messages import (
 )
 from holdfast.protocol.question import Provenance, Question
 from holdfast.protocol.replica_set import Replica
-from holdfast.protocol.robot_events import Abandon, Effects, RobotEffect, Send
+from holdfast.protocol.robot_events import Abandon, RobotEffect, Send
 from holdfast.protocol.verification import Verification
 
 _MAX_CALLS = 4

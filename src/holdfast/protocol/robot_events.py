@@ -11,14 +11,14 @@ sent or performed that a restarted robot would not know of.
 
 from __future__ import annotations
 
-from collections import Counter
-from typing import Generic, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Literal, NamedTuple, TypeAlias
 
 from holdfast.errors import HoldfastError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.inputs import Late, Moved, Record, Sensed
 from holdfast.planning.outcome import Ending, TrialResult
 from holdfast.planning.planner import PlanningState
+from holdfast.protocol.effects import LogEvent
 
 
 class ServiceAppeared(NamedTuple):
@@ -188,13 +188,6 @@ class Launch(NamedTuple):
     number: int
 
 
-class LogEvent(NamedTuple):
-    """One line of the log of a robot or a service: plain data; durations end in ``_ms``."""
-
-    name: str
-    fields: dict[str, object]
-
-
 class Timing(NamedTuple):
     """Who made a decision, and how long it took; for the tables only."""
 
@@ -239,23 +232,3 @@ RobotEffect: TypeAlias = (
     | Paused
     | Halt
 )
-
-_Effect = TypeVar("_Effect")
-
-
-class Effects(list[_Effect | LogEvent], Generic[_Effect]):
-    """The effects of one end so far; its parts share this list, since their order counts."""
-
-    def __init__(self) -> None:
-        # Events for metrics, by kind, also those that were not reported.
-        self.counts: Counter[str] = Counter()
-
-    def report(self, name: str, **fields: object) -> None:
-        """Append a line of the log."""
-        self.append(LogEvent(name, fields))
-
-    def take(self) -> list[_Effect | LogEvent]:
-        """Return the effects so far, and clear them."""
-        effects = self.copy()
-        self.clear()
-        return effects

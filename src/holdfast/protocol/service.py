@@ -34,8 +34,8 @@ from holdfast.planning.planner import needs_sensing
 from holdfast.problems.problem import Problem
 from holdfast.protocol.computing_time import ExpectedTime
 from holdfast.protocol.decision_cost import ANY_MACHINE, Cost, Pricing
+from holdfast.protocol.effects import Effects
 from holdfast.protocol.messages import MAX_WORD, Request, SessionConfiguration, pack_configuration
-from holdfast.protocol.robot_events import Effects
 from holdfast.protocol.service_jobs import (
     Computed,
     EndCall,

@@ -40,6 +40,7 @@ from holdfast.protocol.decision_cost import (
     cost_of_answer,
     describe_cost,
 )
+from holdfast.protocol.effects import LogEvent
 from holdfast.protocol.messages import (
     DIGEST_SIZE,
     MAX_ACTION_SIZE,
@@ -48,7 +49,6 @@ from holdfast.protocol.messages import (
     SessionConfiguration,
     unpack_configuration,
 )
-from holdfast.protocol.robot_events import LogEvent
 from holdfast.protocol.service_limits import ServiceLimits
 
 _COSTS_PER_PROBLEM = 128

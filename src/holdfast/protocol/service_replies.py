@@ -11,6 +11,7 @@ import hashlib
 import math
 from collections import OrderedDict
 
+from holdfast.protocol.effects import Effects
 from holdfast.protocol.messages import (
     MAX_TEXT,
     MAX_WORD,
@@ -23,7 +24,6 @@ from holdfast.protocol.messages import (
     TaskAnswer,
     encode,
 )
-from holdfast.protocol.robot_events import Effects
 from holdfast.protocol.service_jobs import EndCall, SendReply, ServiceEffect
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
 from holdfast.protocol.service_sessions import CachedAnswer, PendingTask, WaitingCall

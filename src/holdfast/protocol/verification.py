@@ -27,11 +27,11 @@ import numpy as np
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.planner import Planner
 from holdfast.problems import checked
+from holdfast.protocol.effects import Effects
 from holdfast.protocol.messages import DIGEST_SIZE, SensingAnswer
 from holdfast.protocol.question import OWN_PLANNER, Provenance, Question, WrongAnswer, same_actions
 from holdfast.protocol.robot_events import (
     ComputeOwnAnswer,
-    Effects,
     OwnAnswer,
     RobotEffect,
     VerificationNoted,

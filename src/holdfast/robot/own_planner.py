@@ -14,7 +14,7 @@ from __future__ import annotations
 import functools
 from collections import deque
 from collections.abc import Callable
-from time import perf_counter
+from time import perf_counter, thread_time
 
 from holdfast.errors import HoldfastError
 from holdfast.planning.planner import Planner
@@ -76,7 +76,7 @@ class OwnPlanner:
         """Compute and deliver the waiting brief part; return whether there was one."""
         effect, self._brief = self._brief, None
         if effect is not None:
-            self._finished(effect, self._computed(effect))
+            self._finished(effect, *self._computed(effect))
         return effect is not None
 
     def close(self, timeout_s: float = 1.0) -> None:
@@ -89,21 +89,23 @@ class OwnPlanner:
             self._submit(self._waiting.popleft())
 
     def _submit(self, effect: ComputeOwnAnswer) -> None:
-        finished = functools.partial(self._finished, effect)
-        self._thread.submit(functools.partial(self._computed, effect), finished)
+        compute = functools.partial(self._computed, effect)
+        self._thread.submit(compute, lambda computed: self._finished(effect, *computed))
 
-    def _finished(self, effect: ComputeOwnAnswer, answer: OwnAnswer) -> None:
+    def _finished(self, effect: ComputeOwnAnswer, answer: OwnAnswer, processor_s: float) -> None:
         if effect.part is not None and self._may_be_brief:
-            self._usual[effect.part].learn(answer.computed_s)
+            self._usual[effect.part].learn(answer.computed_s, processor_s)
         self._compute_next()
         self._deliver(answer)
 
-    def _computed(self, effect: ComputeOwnAnswer) -> OwnAnswer:
-        began = perf_counter()
+    def _computed(self, effect: ComputeOwnAnswer) -> tuple[OwnAnswer, float]:
+        """Return the answer, and the processor time that it took."""
+        began, used_s = perf_counter(), thread_time()
         try:
             if self._planner is None or effect.again:
                 self._planner = self._make_planner()
-                began = perf_counter()  # the time for building the problem predicts nothing
+                # The time for building the problem predicts nothing.
+                began, used_s = perf_counter(), thread_time()
             answer = _answer(self._planner, effect)
         except BaseException as error:
             if effect.part is None:  # user code may raise anything
@@ -114,7 +116,7 @@ class OwnPlanner:
                 answer = OwnAnswer(effect.number, failure=error)
             else:
                 raise
-        return answer._replace(computed_s=perf_counter() - began)
+        return answer._replace(computed_s=perf_counter() - began), thread_time() - used_s
 
 
 def _answer(planner: Planner, effect: ComputeOwnAnswer) -> OwnAnswer:

@@ -28,6 +28,7 @@ from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import PlanningState
 from holdfast.planning.tracking import Trial, replay
 from holdfast.protocol.dispatcher import Dispatcher
+from holdfast.protocol.effects import LogEvent
 from holdfast.protocol.question import DecisionSource, InProcessSource
 from holdfast.protocol.robot import Robot
 from holdfast.protocol.robot_events import (
@@ -40,7 +41,6 @@ from holdfast.protocol.robot_events import (
     EnvironmentReady,
     Halt,
     Launch,
-    LogEvent,
     OwnAnswer,
     Paused,
     RecoveryExited,

@@ -11,14 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.config.reading import absolute_endpoint
 from holdfast.errors import InvalidValueError, TransportError
-from holdfast.runtime.command_line import (
-    Options,
-    flag,
-    location,
-    number,
-    option,
-    whole_number,
-)
+from holdfast.runtime.command_line import Options, flag, location, number, option, whole_number
 from holdfast.runtime.log_lines import LogFormat
 from holdfast.runtime.logs import log_option
 from holdfast.runtime.watchdog import DEFAULT_WATCHDOG_S, watchdog_option

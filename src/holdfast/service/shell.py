@@ -34,8 +34,8 @@ from typing import Literal, TypeAlias
 import msgspec
 
 from holdfast.errors import DEFECT, MessageError, defect_fields
+from holdfast.protocol.effects import LogEvent
 from holdfast.protocol.messages import Busy, Refused, Request, decode_request, encode
-from holdfast.protocol.robot_events import LogEvent
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_batches import run_together
 from holdfast.protocol.service_jobs import (
@@ -99,7 +99,7 @@ class ServiceShell:
         self._unread = 0
         self._rates = EventRates()
         self._brief_jobs: deque[Job] = deque()
-        self._has_replied = False  # since the last brief job
+        self._has_replied = False  # since the last brief job, and has more to reply
         self._timer: asyncio.TimerHandle | None = None
         self._idle: asyncio.Future[None] | None = None
         self._closed = False
@@ -328,7 +328,7 @@ class ServiceShell:
             if isinstance(effect, SendReply):
                 is_last = isinstance(following, EndCall) and following.call == effect.call
                 self._calls[effect.call].reply(effect.payload, last=is_last)
-                self._has_replied = True
+                self._has_replied |= not is_last
             elif isinstance(effect, EndCall):
                 self._calls.pop(effect.call).end()
             elif isinstance(effect, StartJob):

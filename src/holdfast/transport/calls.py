@@ -18,20 +18,6 @@ from holdfast.protocol.robot_events import (
 )
 
 
-def too_large(size_bytes: int, max_message_bytes: int) -> bytes:
-    """Return the reply to a request that is larger than allowed."""
-    # Imported here because it imports NumPy, which no transport needs.
-    from holdfast.protocol.messages import Refused, encode
-
-    return encode(
-        Refused(
-            0,
-            "too_large",
-            f"a request of {size_bytes} bytes: at most {max_message_bytes} are allowed",
-        )
-    )
-
-
 class CallTable:
     """Calls in flight of one robot's end; delivers each one's events in order and one end."""
 

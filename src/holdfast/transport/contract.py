@@ -11,12 +11,27 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from holdfast.protocol.robot_events import TransportEvent
+if TYPE_CHECKING:
+    from holdfast.protocol.robot_events import TransportEvent
 
 DEFAULT_MAX_MESSAGE_BYTES = 64 * 1024 * 1024
 """Default bound on a message: a state of a million particles fills 56 MB."""
+
+
+def too_large(size_bytes: int, max_message_bytes: int) -> bytes:
+    """Return the reply to a request that is larger than allowed."""
+    # Imported here because it imports NumPy, which no transport needs.
+    from holdfast.protocol.messages import Refused, encode
+
+    return encode(
+        Refused(
+            0,
+            "too_large",
+            f"a request of {size_bytes} bytes: at most {max_message_bytes} are allowed",
+        )
+    )
 
 
 class RobotTransport(Protocol):

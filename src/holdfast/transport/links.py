@@ -261,12 +261,7 @@ class Link(asyncio.BufferedProtocol):
         """Ignore what still comes of a call."""
 
     def end(
-        self,
-        reason: str,
-        *,
-        goodbye: str | None = None,
-        refused: bool = False,
-        abort: bool = False,
+        self, reason: str, *, goodbye: str | None = None, refused: bool = False, abort: bool = False
     ) -> None:
         """End the link; the owner is notified in a later turn of the loop. May be repeated.
 

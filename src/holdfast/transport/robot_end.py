@@ -16,8 +16,8 @@ from itertools import count
 
 from holdfast.errors import DEFECT, FrameError, InvalidValueError, TransportError, defect_fields
 from holdfast.protocol.robot_events import TransportEvent
-from holdfast.transport.calls import CallTable, too_large
-from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES
+from holdfast.transport.calls import CallTable
+from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, too_large
 from holdfast.transport.dialer import Dialer
 from holdfast.transport.endpoints import (
     Endpoint,

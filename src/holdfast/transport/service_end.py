@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from holdfast.errors import DEFECT, FrameError, TransportError, defect_fields
-from holdfast.transport.calls import too_large
-from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
+from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall, too_large
 from holdfast.transport.endpoints import (
     REVOKED_FILE,
     Endpoint,

@@ -24,6 +24,7 @@ from holdfast.planning.settings import (
 )
 from holdfast.planning.tracking import Trial, replay
 from holdfast.protocol.dispatcher import Dispatcher
+from holdfast.protocol.effects import LogEvent
 from holdfast.protocol.messages import MAX_TASK_ACTIONS
 from holdfast.protocol.robot import Robot
 from holdfast.protocol.robot_events import (
@@ -36,7 +37,6 @@ from holdfast.protocol.robot_events import (
     EnvironmentReady,
     Halt,
     Launch,
-    LogEvent,
     NoReading,
     OwnAnswer,
     Paused,

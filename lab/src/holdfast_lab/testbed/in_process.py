@@ -13,8 +13,8 @@ import msgspec
 
 from holdfast.errors import InvalidValueError, TransportError
 from holdfast.protocol.robot_events import TransportEvent
-from holdfast.transport.calls import CallTable, too_large
-from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall
+from holdfast.transport.calls import CallTable
+from holdfast.transport.contract import DEFAULT_MAX_MESSAGE_BYTES, IncomingCall, too_large
 
 
 class InProcessNetwork:
