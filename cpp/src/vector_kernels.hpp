@@ -64,7 +64,7 @@ struct CompactPosterior {
 };
 
 /// The most points of few_nearest.
-inline constexpr std::size_t few_points = 8 * leaf_size;
+inline constexpr std::size_t few_points = 16 * leaf_size;
 
 /// Points of a prior that are worked on together.
 inline constexpr std::size_t prior_block_size = 32;
