@@ -12,6 +12,7 @@ from tests.fuzz.hostile_settings import hostile_settings, numeric_keys, random_s
 from holdfast.config import registry
 from holdfast.planning.settings import Method, PlanningSettings
 from holdfast.problems.capsule_robot import CapsuleRobot
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.decision_cost import (
     COSTLY,
     FREE,
@@ -157,6 +158,83 @@ def test_the_words_name_the_keys_of_the_method() -> None:
         assert f"selector.{key}" in words
     assert "3 sensing actions" in words
     assert "path_offsets" not in words
+
+
+class Angular(PegInHole2D):
+    """Whose rollouts and paths are Python's, and whose last coordinate is an angle."""
+
+    own = TYPICAL_PROBLEM._replace(observation_size=3)
+    circular = circular_actions = (2,)
+    move = PegInHole2D.move
+
+
+class General(Angular):
+    """Which gives a likelihood, and returns from known states."""
+
+    own = TYPICAL_PROBLEM._replace(known_return=CallCost(9e-6, 50e-9))
+    rank_test = True
+
+    def log_likelihood(self, states: Any, sensing_action: int, observation: Any) -> Any: ...
+
+
+FINE = {"num_nearest_neighbors": 7, "num_particles": 2500, "estimate": "heaviest_mode"}
+NESTED = {"horizon": 2, "sensing_interval": 4}
+ROLLED = {"method": "expected_return", "max_observation_samples": 80}
+KEYS = {each.rpartition(".")[2]: each for each in COSTLY} | {
+    "estimate": "particle_filter.estimate",
+    **{name: f"selector.{name}" for name in ("method", "estimator", "sensing_is_optional")},
+}
+
+
+@pytest.mark.parametrize(
+    ("problem", "changes", "expected"),
+    [
+        (PegInHole2D, {}, (0.0081215, 590880, 0.003113944, 91500)),
+        (PegInHole2D, {"method": "random"}, (0.00018, 9600, 0.003113944, 91500)),
+        (
+            PegInHole2D,
+            {**FINE, **NESTED, "method": "action_entropy"},
+            (0.73154934518, 19700480, 0.416612544, 760300),
+        ),
+        (
+            PegInHole2D,
+            {"estimator": "gaussian_mixture_upper", "path_offsets": (0, 3, 9)},
+            (0.0089228, 1097280, 0.003113944, 91500),
+        ),
+        (PegInHole2D, FINE, (0.072895320302, 6520480, 0.416612544, 760300)),
+        (Angular, {"path_offsets": (0, 3, 9)}, (0.02152575, 830880, 0.005045344, 98700)),
+        (
+            General,
+            {**NESTED, "method": "state_entropy"},
+            (0.025456680751, 2465280, 0.005484344, 91500),
+        ),
+        (
+            General,
+            {"method": "action_covariance", "sensing_is_optional": True},
+            (0.000822, 593440, 0.005484344, 91500),
+        ),
+        (PegInHole2D, ROLLED, (0.0323799, 1218240, 0.003113944, 91500)),
+        (Angular, {**ROLLED, "sensing_interval": 70}, (0.583867, 1573920, 0.005045344, 98700)),
+        (General, ROLLED, (0.34722016, 1447680, 0.005484344, 91500)),
+        (
+            Angular,
+            {**ROLLED, "max_observation_samples": 20},
+            (0.18424364, 497760, 0.005045344, 98700),
+        ),
+    ],
+)
+def test_the_model_in_numbers(
+    problem: type[PegInHole2D], changes: dict[str, object], expected: tuple[float, ...]
+) -> None:
+    """Change them with benchmarks/decision_cost.py: lanes and limits of services follow."""
+    settings = PlanningSettings()
+    for name, value in changes.items():
+        settings = with_key(settings, KEYS[name], value)
+    own = getattr(problem, "own", TYPICAL_PROBLEM)
+    sensing = cost_of_sensing(problem(), settings, own, 1.5)
+    asked: dict[str, Any] = {"steps": 9.0, "inputs": 2.0, "begins": True, "num_bytes": 100.0}
+    reached = cost_of_answer(problem(), settings, own, 1.5, **asked)
+    assert (*sensing, *reached) == pytest.approx(expected, rel=1e-9)
 
 
 def test_drawn_settings_can_be_used() -> None:

@@ -170,6 +170,7 @@ def test_who_fails_in_its_sensing_part_leaves_the_rest_to_another_service() -> N
 def test_the_machine_sleeps_while_nothing_can_be_done() -> None:
     # The local service is up before the cloud was ever seen; World.run asserts the rest.
     world = World(launch="at_start")
+    assert any(isinstance(e, Launch) for e in World(launch="at_start").robot.start(0.0))
     world.launch_s = 0.1
     world.start(present=False)
     world.run()

@@ -283,6 +283,11 @@ class TestRefusals:
             self.world.move(np.ones((3, 2)), np.ones(3), np.ones(2), 1e-3, fresh())
         with pytest.raises(InvalidValueError, match="does not broadcast"):
             self.world.move(np.ones((3, 2)), np.ones((4, 2)), np.ones(2), 1e-3, fresh())
+        for states, actions in (((3, 2), (3, 2)), ((4, 5, 2), (3, 2)), ((3, 5, 2), (4, 2))):
+            with pytest.raises(InvalidValueError, match=r"must be \(3, n, 2\) and \(3, 2\)"):
+                self.world.move_each(
+                    np.ones(states), np.ones(actions), np.ones(2), 1e-3, [fresh()] * 3, 1
+                )
         with pytest.raises(InvalidValueError, match="standard_deviation"):
             self.world.move(np.ones((3, 2)), np.ones(2), np.ones(3), 1e-3, fresh())
         with pytest.raises(InvalidValueError, match="mean"):

@@ -429,6 +429,7 @@ class TestDamage:
                 unfinished = unfinished_of(path)
                 assert unfinished is not None
                 assert unfinished.is_complete
+                assert path.stat().st_size == len(before) + (size if size == len(tail) else 0)
                 # Whole, it may as well be there: nobody was told that it is not.
                 assert unfinished.records == all_records(1 + (size == len(tail)))
             with Journal.open(path) as journal:

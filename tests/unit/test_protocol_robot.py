@@ -24,6 +24,7 @@ from holdfast.protocol.robot import Robot
 from holdfast.protocol.robot_events import (
     Act,
     Acted,
+    EndTrial,
     EnvironmentFailed,
     EnvironmentReady,
     Halt,
@@ -425,6 +426,9 @@ def test_rate_paces_the_steps_and_counts_missed_ticks() -> None:
     assert 3 <= world.robot.missed_ticks <= 6
     reported = sum(int(str(f["missed"])) for f in world.reports("missed_ticks"))
     assert reported == world.robot.missed_ticks
+    told = next(at for at, e in world.trace if isinstance(e, LogEvent) and e.name == "missed_ticks")
+    ended = next(at for at, e in world.trace if isinstance(e, EndTrial))
+    assert told < ended  # as soon as they are missed
 
 
 def test_a_robot_that_takes_its_task_actions_itself_waits_at_sensing_steps_alone() -> None:

@@ -47,6 +47,8 @@ def test_trials_of_several_arms(tmp_path: Path, jobs: int) -> None:
             pool.submit(arms[0], trial)
         pool.drop(arms[0])
         assert list(pool.run()) == []
+        pool.submit(arms[0], 0)
+    assert pool.waiting == 0
     assert sorted(found) == [(arm.label, trial) for arm in arms for trial in (0, 2)]
     assert found["as it is", 2].digest == one(configuration_of(tmp_path), 2).digest
     assert found["random", 2].digest != found["as it is", 2].digest
@@ -162,6 +164,7 @@ def test_a_dead_worker_is_named_and_costs_no_other_trial(tmp_path: Path) -> None
                     assert pid is not None
                     os.kill(pid, signal.SIGKILL)
         finished += [done.trial for done in pool.run(more)]
+    assert (died.value.overdue, died.value.killed) == (False, True)
     assert sorted([*finished, died.value.trial]) == list(range(60))
 
 
