@@ -17,7 +17,13 @@ from holdfast.numerics.randomness import Purpose, Stream, stream
 from holdfast.planning.belief import Belief
 from holdfast.planning.estimators import GaussianMixture, NearestNeighbor, PriorNeighbors, entropy
 from holdfast.planning.sensing import SensingInfo, choose_sensing_action
-from holdfast.planning.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
+from holdfast.planning.settings import (
+    FEW_PARTICLES,
+    ActiveSensingSettings,
+    Estimator,
+    PlanningSettings,
+    SelectorSettings,
+)
 from holdfast.problems.problem import Problem, ProblemBase
 
 HYPOTHESES = stream(41, 0, 0, Purpose.HYPOTHESES)
@@ -58,7 +64,7 @@ class Coordinates(ProblemBase):
         return np.asarray((np.abs(states) < 0.1).all(axis=-1))
 
 
-def settings_of(selector: SelectorSettings | None = None, **sensing: int) -> PlanningSettings:
+def settings_of(selector: SelectorSettings | None = None, **sensing: float) -> PlanningSettings:
     active_sensing = msgspec.structs.replace(ActiveSensingSettings(num_cores=1), **sensing)
     return PlanningSettings(
         active_sensing=active_sensing,
@@ -89,6 +95,33 @@ class TestWhatIsChosen:
         for j, row in enumerate(rows):
             assert info.entropies[j] == info.entropies[rows.index(row)]
         assert index == expected
+
+    @pytest.mark.parametrize("horizon", [1, 3])
+    def test_the_same_resolution_for_each_coordinate(self, horizon: int) -> None:
+        found = []
+        for resolution in (0.1, (0.1, 0.1)):
+            selector = SelectorSettings(
+                method="action_entropy", estimator="nearest_neighbor", resolution=resolution
+            )
+            settings = settings_of(selector, horizon=horizon, discount=0.5)
+            found.append(choose(Coordinates(), settings, belief_of(2.0, 0.2))[1])
+        for own, other in zip(*(each[:2] for each in found), strict=True):
+            np.testing.assert_allclose(own, other, rtol=1e-12)
+
+    @pytest.mark.parametrize(
+        ("count", "estimator"),
+        [(FEW_PARTICLES, "prior_neighbors"), (FEW_PARTICLES + 1, "nearest_neighbor")],
+    )
+    def test_few_particles_have_an_estimator_of_their_own(
+        self, count: int, estimator: Estimator
+    ) -> None:
+        belief, entropies = belief_of(2.0, 0.2, count=count), []
+        for given in (None, estimator):
+            selector = SelectorSettings(method="path_entropy", estimator=given)
+            _, info = choose(Coordinates(), settings_of(selector), belief)
+            assert info.entropies is not None
+            entropies.append(info.entropies.tolist())
+        assert entropies[0] == entropies[1]
 
 
 class TestBlindChoices:
@@ -346,6 +379,14 @@ class TestBadInput:
             with pytest.raises(ProblemError, match=rf"policy of coordinates returned \[.*{bad}\]"):
                 choose(Broken(policy=actions), settings_of(selector), belief)
 
+    def test_policy_of_a_predicted_state_out_of_bounds(self) -> None:
+        class Far(Coordinates):
+            def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+                return np.full(states.shape, 1e160)
+
+        with pytest.raises(ProblemError, match=r"returned \[-1\.e.*in the predicted state \[1\.e"):
+            choose(Far(), settings_of(horizon=2), belief_of(1.0, 1.0))
+
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
     def test_observation_mean_not_finite(self, bad: float) -> None:
         mean = np.zeros((60, 1))
@@ -451,6 +492,7 @@ class TestBadInput:
             assert info.entropies is not None
             found.append((chosen, info.entropies.tobytes(), info.likelihoods))
             calls.append((len(asked), sum(asked)))
+            assert info.likelihoods == 60 * sum(asked)
         assert found[0] == found[1] == found[2]
         samples = settings.active_sensing.num_observation_samples
         assert calls[0] == calls[2] == (sum(asked), sum(asked))
