@@ -6,7 +6,15 @@ import pytest
 from tests.robot_world import LOCAL, SmallService, World, answer_third_slowly, nth
 
 from holdfast.errors import ServiceRefusedError
-from holdfast.protocol.messages import Busy, Refused, Reply, Request, TaskAnswer, encode
+from holdfast.protocol.messages import (
+    Busy,
+    Progress,
+    Refused,
+    Reply,
+    Request,
+    TaskAnswer,
+    encode,
+)
 from holdfast.protocol.robot_events import (
     Launch,
     LogEvent,
@@ -63,6 +71,7 @@ def test_the_exit_of_a_local_service_is_logged_although_its_link_still_stands() 
     world.on_act = fault
     world.complete()
     assert world.reports("recovery_exited") == [{"reason": "signal 9"}]
+    assert [e["service"] for e in world.reports("service_vanished")] == ["cloud", LOCAL]
     assert len([e for _, e in world.trace if isinstance(e, Launch)]) == 2
 
 
@@ -191,6 +200,29 @@ def test_the_machine_sleeps_while_nothing_can_be_done() -> None:
     assert told
 
 
+def test_a_call_that_ends_once_another_service_has_answered_is_no_loss() -> None:
+    world = World(services=("slow", "prompt"))
+    slow = world.services["slow"]
+    slow.latency_s = 0.065
+    slow.rule = lambda r: [Progress(r.number, False)] * 3 if nth(r) == 3 else None
+    world.complete()
+    assert {sent.service for sent in world.sent} == {"slow", "prompt"}
+    assert not world.reports("suspected")
+
+
+def test_a_robot_that_nobody_answers_holds_once() -> None:
+    world = World(launch="never")
+
+    def fault(performed: int) -> None:
+        if performed == 8 and not world.results:
+            world.kill("cloud")
+            world.bring_up("cloud", 0.42)
+
+    world.on_act = fault
+    world.complete()
+    assert [each["step"] for each in world.reports("holding")] == [8]
+
+
 def test_a_long_wait_is_told_although_the_service_shows_life() -> None:
     world = World()
     answer_third_slowly(world.services["cloud"], num_signs=20)
@@ -222,6 +254,10 @@ def test_another_process_of_a_service_that_refused_for_good_is_asked() -> None:
         if isinstance(e, LogEvent) and e.fields.get("to") == "keep_alive"
     )
     assert {sent.service for sent in world.sent if sent.at > back_at} == {"cloud"}
+    appeared_at = [
+        at for at, e in world.trace if isinstance(e, LogEvent) and e.name == "service_appeared"
+    ][-1]
+    assert appeared_at in {sent.at for sent in world.sent}  # it need not wait for the next turn
 
 
 def test_the_same_process_behind_another_link_still_refuses() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 import pytest
@@ -105,7 +106,8 @@ def reference_move(
     return result
 
 
-WORLDS: dict[str, tuple[World, FloatArray, FloatArray, FloatArray]] = {
+Case: TypeAlias = tuple[World, FloatArray, FloatArray, FloatArray]
+WORLDS: dict[str, Case] = {
     "disc": (
         DiscWorld(0.1, [(-FAR, -FAR, FAR, 0.0), (0.0, 0.0, 0.1, 5.0)]),
         np.array([-0.15, 0.15]),
@@ -128,14 +130,12 @@ WORLDS: dict[str, tuple[World, FloatArray, FloatArray, FloatArray]] = {
 
 
 @pytest.fixture(params=WORLDS)
-def case(request: pytest.FixtureRequest) -> tuple[World, FloatArray, FloatArray, FloatArray]:
+def case(request: pytest.FixtureRequest) -> Case:
     return WORLDS[request.param]
 
 
 class TestMove:
-    def test_equals_the_reference_bit_for_bit(
-        self, case: tuple[World, FloatArray, FloatArray, FloatArray]
-    ) -> None:
+    def test_equals_the_reference_bit_for_bit(self, case: Case) -> None:
         world, mean, deviation, action = case
         states, unplaced = world.draw_free(mean, deviation, 60, fresh().substream(9))
         assert unplaced == 0
@@ -145,9 +145,7 @@ class TestMove:
         expected = reference_move(world, states, actions, deviation, 1e-3, fresh())
         assert moved.tobytes() == expected.tobytes()
 
-    def test_a_particle_does_not_depend_on_the_others_or_on_threads(
-        self, case: tuple[World, FloatArray, FloatArray, FloatArray]
-    ) -> None:
+    def test_a_particle_does_not_depend_on_the_others_or_on_threads(self, case: Case) -> None:
         world, mean, deviation, action = case
         count = 5000  # above the kernel's threshold for threads
         states, _ = world.draw_free(mean, deviation, count, fresh())

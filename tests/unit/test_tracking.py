@@ -184,6 +184,8 @@ def test_the_log_has_what_was_shown() -> None:
     acted(plain)
     acted(shown, motion=np.array([0.1]))
     assert [len(trial.log.decisions().log) for trial in (plain, shown)] == [45 + 17, 45 + 17 + 41]
+    begin_anew(shown)
+    assert len(shown.log.decisions().log) == 45 + 17 + 41 + 41
     assert plain.result(None).digest != shown.result(None).digest
     assert len(list(shown.log.decisions())) == 2
 
@@ -235,12 +237,14 @@ def test_the_account_of_a_trial() -> None:
     trial = Trial(Planner(problem, PlanningSettings(sensing_interval=0)), 1, 0)
     counts = [(trial.num_sensed, trial.num_inputs, trial.num_unexplained)]
     far = np.array([1e3])
+    assert not trial.begun
 
     def note() -> None:
         counts.append((trial.num_sensed, trial.num_inputs, trial.num_unexplained))
 
     sense(trial, 0, far, 2.0)
     note()
+    assert trial.begun
     move(trial, np.zeros(1), reward=-1.0)
     note()
     sense(trial, 0, None, 4.0)
@@ -284,6 +288,7 @@ def test_an_alarm_is_that_of_the_last_input(kind: str) -> None:
     else:
         sense(trial, 0, far, 0.0)
     assert alarm_of(trial) == "lost"
+    assert trial.is_lost
     if kind == "observed":
         acted(trial)
         observed(trial, None)
