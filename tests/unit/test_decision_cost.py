@@ -85,14 +85,6 @@ def test_a_setting_that_is_no_factor_changes_nothing(key: str) -> None:
         )
 
 
-@pytest.mark.parametrize("factor", ["steps", "inputs", "num_bytes", "begins"])
-def test_what_a_request_asks_for_counts(factor: str) -> None:
-    settings = PlanningSettings()
-    few: dict[str, Any] = {factor: False if factor == "begins" else 1.0}
-    many: dict[str, Any] = {factor: True if factor == "begins" else 1000.0}
-    assert answer(settings, **few).seconds < answer(settings, **many).seconds
-
-
 def test_more_sensing_actions_cost_more() -> None:
     many_actions = CapsuleRobot()
     many_actions.sensing_actions = tuple(map(str, range(200)))

@@ -212,13 +212,7 @@ def test_a_call_that_ends_once_another_service_has_answered_is_no_loss() -> None
 
 def test_a_robot_that_nobody_answers_holds_once() -> None:
     world = World(launch="never")
-
-    def fault(performed: int) -> None:
-        if performed == 8 and not world.results:
-            world.kill("cloud")
-            world.bring_up("cloud", 0.42)
-
-    world.on_act = fault
+    world.lose_the_cloud_for_a_while()
     world.complete()
     assert [each["step"] for each in world.reports("holding")] == [8]
 

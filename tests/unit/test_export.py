@@ -779,8 +779,6 @@ class TestRefusals:
         tmp_path: Path,
         monkeypatch: pytest.MonkeyPatch,
     ) -> None:
-        import sys
-
         place.run(PEG)
         monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
         said = place.export("--mcap", "run.mcap", code=2)

@@ -31,46 +31,34 @@ def collides(world: World, *state: float) -> bool:
     return bool(world.collides(np.array(state)))
 
 
-class TestDisc:
-    world = DiscWorld(0.5, [(0.0, 0.0, 2.0, 1.0)])
-
-    def test_beside_an_edge(self) -> None:
-        assert collides(self.world, 1.0, 1.49)
-        assert not collides(self.world, 1.0, 1.51)
-
-    def test_at_a_corner_the_distance_counts_not_the_bounding_box(self) -> None:
-        assert not collides(self.world, 2.4, 1.4)  # at distance 0.566
-        assert collides(self.world, 2.3, 1.3)  # at distance 0.424
-
-    def test_centre_inside(self) -> None:
-        assert collides(self.world, 1.0, 0.5)
-
-    def test_touching_is_free(self) -> None:
-        assert not collides(self.world, 1.0, 1.5)
-        assert not collides(self.world, -0.5, 0.5)
+DISC = DiscWorld(0.5, [(0.0, 0.0, 2.0, 1.0)])
+STANDING = RectangleWorld(1.0, 2.0, GROUND)
+BRICK = BoxWorld((1.0, 2.0, 3.0), [(-9.0, -9.0, -9.0, 9.0, 9.0, 0.0)])
 
 
-class TestRectangle:
-    world = RectangleWorld(1.0, 2.0, GROUND)
+@pytest.mark.parametrize(
+    ("world", "free", "colliding"),
+    [
+        (DISC, (1.0, 1.51), (1.0, 1.49)),  # beside an edge
+        (DISC, (2.4, 1.4), (2.3, 1.3)),  # at a corner: at distances 0.566 and 0.424
+        (DISC, (1.0, 1.5), (1.0, 0.5)),  # touching; with its centre inside
+        (DISC, (-0.5, 0.5), (-0.5 + 1e-9, 0.5)),
+        (STANDING, (123.0, 1.0, 0.0), (123.0, 1.0 - 1e-9, 0.0)),
+        (BRICK, (0.0, 0.0, 1.5, 0.0, 0.0, 0.0), (0.0, 0.0, 1.5 - 1e-9, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_touching_is_free(
+    world: World, free: tuple[float, ...], colliding: tuple[float, ...]
+) -> None:
+    assert not collides(world, *free)
+    assert collides(world, *colliding)
 
-    def test_touching_is_free(self) -> None:
-        assert not collides(self.world, 123.0, 1.0, 0.0)
 
-    def test_overlapping_by_little_collides(self) -> None:
-        assert collides(self.world, 123.0, 1.0 - 1e-9, 0.0)
-
-
-class TestBox:
-    def test_touching_is_free(self) -> None:
-        world = BoxWorld((1.0, 2.0, 3.0), [(-9.0, -9.0, -9.0, 9.0, 9.0, 0.0)])
-        assert not collides(world, 0.0, 0.0, 1.5, 0.0, 0.0, 0.0)
-        assert collides(world, 0.0, 0.0, 1.5 - 1e-9, 0.0, 0.0, 0.0)
-
-    def test_parallel_edges_separate_nothing(self) -> None:
-        # Without care, the cross product of parallel edges is a zero axis that "separates" all.
-        world = BoxWorld((1.0, 1.0, 1.0), [(-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)])
-        for angles in np.eye(3) * 0.7:
-            assert collides(world, 0.3, 0.2, 0.1, *angles)
+def test_parallel_edges_separate_nothing() -> None:
+    # Without care, the cross product of parallel edges is a zero axis that "separates" all.
+    world = BoxWorld((1.0, 1.0, 1.0), [(-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)])
+    for angles in np.eye(3) * 0.7:
+        assert collides(world, 0.3, 0.2, 0.1, *angles)
 
 
 def reference_move(

@@ -84,6 +84,12 @@ def choose(
     return choose_sensing_action(problem, settings, belief, stage, HYPOTHESES, SELECTION)
 
 
+def entropies(problem: Problem, settings: PlanningSettings, belief: Belief) -> FloatArray:
+    found = choose(problem, settings, belief)[1].entropies
+    assert found is not None
+    return found
+
+
 class TestWhatIsChosen:
     @pytest.mark.parametrize(
         ("rows", "expected"), [([0, 0, 0], 0), ([1, 0, 0, 1], 1), ([1, 1, 0, 0], 2), ([0, 1, 0], 0)]
@@ -115,13 +121,11 @@ class TestWhatIsChosen:
     def test_few_particles_have_an_estimator_of_their_own(
         self, count: int, estimator: Estimator
     ) -> None:
-        belief, entropies = belief_of(2.0, 0.2, count=count), []
+        belief, found = belief_of(2.0, 0.2, count=count), []
         for given in (None, estimator):
             selector = SelectorSettings(method="path_entropy", estimator=given)
-            _, info = choose(Coordinates(), settings_of(selector), belief)
-            assert info.entropies is not None
-            entropies.append(info.entropies.tolist())
-        assert entropies[0] == entropies[1]
+            found.append(entropies(Coordinates(), settings_of(selector), belief).tolist())
+        assert found[0] == found[1]
 
 
 class TestBlindChoices:
@@ -229,22 +233,20 @@ class TestNotSensing:
         estimator: NearestNeighbor | GaussianMixture | PriorNeighbors,
     ) -> None:
         belief = unequal(belief_of(1.0, 2.0))
-        _, info = choose(Coordinates(), settings_of(optional(selector)), belief)
-        assert info.entropies is not None
+        found = entropies(Coordinates(), settings_of(optional(selector)), belief)
         expected = entropy(-belief.states, belief.weights, estimator)
-        np.testing.assert_allclose(info.entropies[2], expected, rtol=1e-13)
+        np.testing.assert_allclose(found[2], expected, rtol=1e-13)
 
     def test_path_entropy_adds_up_those_along_the_path(self) -> None:
         belief = belief_of(1.0, 2.0)
-        _, info = choose(Coordinates(), settings_of(optional(OPTIONAL[3])), belief)
-        assert info.entropies is not None
+        found = entropies(Coordinates(), settings_of(optional(OPTIONAL[3])), belief)
         # Without limits all particles are at the goal after a step, and there every action is 0.
         estimator = PriorNeighbors(belief.weights, 5, 0.1)
         now, later = (
             entropy(points, belief.weights, estimator)
             for points in (-belief.states, np.zeros((60, 2)))
         )
-        np.testing.assert_allclose(info.entropies[2], now + 0.5 * later, rtol=1e-13)
+        np.testing.assert_allclose(found[2], now + 0.5 * later, rtol=1e-13)
 
     @pytest.mark.parametrize("selector", OPTIONAL)
     @pytest.mark.parametrize("kind", [Nothing, GeneralNothing])
@@ -431,11 +433,8 @@ class TestBadInput:
         problem: Problem, first: SelectorSettings, second: SelectorSettings
     ) -> None:
         belief = belief_of(1.0, 1.0)
-        _, one = choose(problem, settings_of(first), belief)
-        _, other = choose(problem, settings_of(second), belief)
-        assert one.entropies is not None
-        assert other.entropies is not None
-        assert one.entropies.tolist() == other.entropies.tolist()
+        one, other = (entropies(problem, settings_of(each), belief) for each in (first, second))
+        assert one.tolist() == other.tolist()
 
     def test_mixture_of_a_negative_motion_variance(self) -> None:
         class Wrong(Coordinates):

@@ -236,15 +236,14 @@ def test_the_account_of_a_trial() -> None:
     problem = Cart()
     trial = Trial(Planner(problem, PlanningSettings(sensing_interval=0)), 1, 0)
     counts = [(trial.num_sensed, trial.num_inputs, trial.num_unexplained)]
-    far = np.array([1e3])
-    assert not trial.begun
+    far, begun_before = np.array([1e3]), trial.begun
 
     def note() -> None:
         counts.append((trial.num_sensed, trial.num_inputs, trial.num_unexplained))
 
     sense(trial, 0, far, 2.0)
     note()
-    assert trial.begun
+    assert (begun_before, trial.begun) == (False, True)
     move(trial, np.zeros(1), reward=-1.0)
     note()
     sense(trial, 0, None, 4.0)

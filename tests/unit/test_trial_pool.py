@@ -69,19 +69,15 @@ def test_a_worker_builds_a_problem_once_and_tells_how_each_trial_went(tmp_path: 
     assert finished.result.digest == one(configuration_of(tmp_path), 2).digest
     assert finished.elapsed_s > 0.0
     assert [type(each).__name__ for each in answers(1, 2, arms[1])] == ["_Built", "_Finished"]
-    first, second = (runner._arms[number] for number in (0, 1))
-    assert isinstance(first, Arm)
-    assert isinstance(second, Arm)
-    assert first.problem is second.problem
+    known: dict[int, Any] = runner._arms
+    assert known[0].problem is known[1].problem
     assert [type(each).__name__ for each in answers(0, 3)] == ["_Finished"]
     assert not answers(2, 0)[0].expected  # an arm that it was never sent
     for own, cores in ((None, 2), (1, 1), (8, 2)):
         sensing = msgspec.structs.replace(arms[0].planning.active_sensing, num_cores=own)
         planning = msgspec.structs.replace(arms[0].planning, active_sensing=sensing)
         answers(3, 0, dataclasses.replace(arms[0], planning=planning))
-        found = runner._arms[3]
-        assert isinstance(found, Arm)
-        assert found.planning.active_sensing.num_cores == cores
+        assert known[3].planning.active_sensing.num_cores == cores
 
 
 def test_the_time_of_a_trial_is_a_mean() -> None:
