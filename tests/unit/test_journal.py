@@ -157,7 +157,8 @@ class TestSteps:
             with pytest.raises(InvalidValueError, match=r"trial 3 is not finished .* 4 cannot"):
                 journal.append(TRIAL + 1, records_of(0))
             journal.add(result_of(0))
-            assert unfinished_of(journal).records == records_of(0)
+            journal.append(TRIAL, records_of(1))
+            assert unfinished_of(journal).records == all_records(2)
 
     def test_a_journal_with_steps_is_not_empty(self, path: Path) -> None:
         with Journal.create(path, {}) as journal:
@@ -332,7 +333,6 @@ class TestRun:
     def test_what_begins_or_ends_a_trial_is_on_the_disk(
         self, path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        Journal.create(path, {}).close()
         calls: list[str] = []
         for name in ("fdatasync", "pwrite"):
             real = getattr(os, name)
@@ -342,6 +342,8 @@ class TestRun:
                 return real(*arguments)
 
             monkeypatch.setattr(os, name, call)
+        Journal.create(path, {}).close()
+        assert calls[-2:] == ["fdatasync", "pwrite"]
         for survives in ("process_crash", "power_cut"):
             with Journal.open(path, survives=survives) as journal:
                 trial = len(journal.finished())

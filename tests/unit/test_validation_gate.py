@@ -199,9 +199,10 @@ def test_the_rank_test_finds_what_is_far_and_repeats_itself() -> None:
     assert update(Heavy(), belief, 0, [80.0])[1].within_gate
 
 
-def test_the_rank_test_draws_by_name() -> None:
+def test_the_rank_test_draws_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """Any other numbers would be as good for a filter, but decide otherwise."""
     drawn: list[tuple[float, Stream]] = []
+    densities: list[float] = []
 
     class Noting(Heavy):
         def sample_observation(self, state: np.ndarray, action: int, stream: Stream) -> np.ndarray:
@@ -210,7 +211,13 @@ def test_the_rank_test_draws_by_name() -> None:
 
     random = stream(7, 0, 0, Purpose.RANK_TEST)
     belief = Belief.weighted(random.normal((40, 1)), random.uniform(40))
+    monkeypatch.setattr(
+        "holdfast.planning.belief.is_typical",
+        lambda density, draw: densities.extend((density, *map(draw, range(NUM_RANKED)))),
+    )
     update(Noting(), belief, 0, [80.0], random)
+    likelihoods = np.exp(Heavy().log_likelihood(belief.states, 0, np.array([80.0])))
+    assert densities[0] == pytest.approx(np.log(belief.weights @ likelihoods))
     expected = []
     for own in map(random.substream, range(NUM_RANKED)):
         teeth = (np.arange(40) + own.substream(0).uniform()) / 40
