@@ -401,7 +401,7 @@ class TestWithoutNoise:
     def test_it_does_not_end(self) -> None:
         NOISE_FREE.end()
         assert NOISE_FREE.normal() == 0.0
-        assert NOISE_FREE.anew() is NOISE_FREE
+        assert NOISE_FREE.anew() is NOISE_FREE.lent() is NOISE_FREE
 
     @pytest.mark.parametrize("kind", ["normal", "random", "standard_normal", "uniform"])
     def test_who_waits_for_another_number_is_told(self, kind: str) -> None:

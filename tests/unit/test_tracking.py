@@ -102,7 +102,7 @@ def test_what_is_awaited_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert trial.awaited == (6,)
     with pytest.raises(RecordError, match="of step 0, where none is awaited"):
         come_late(trial, 0, np.array([0.2]))
-    come_late(trial, 6, np.array([0.2]))
+    assert come_late(trial, 6, np.array([0.2])).digest == bits(trial)
 
 
 def test_not_to_sense_awaits_nothing() -> None:
@@ -194,7 +194,7 @@ def test_the_log_has_what_was_shown() -> None:
 def test_the_result_has_the_ending(outcome: Any) -> None:
     trial = Trial(Planner(Cart(), SETTINGS), 1, 0)
     result = trial.result(Ending(outcome, "hit the wall"))
-    assert (result.outcome, result.reason) == (outcome, "hit the wall")
+    assert (result.outcome, result.reason, result.reward) == (outcome, "hit the wall", 0.0)
     assert Trial(trial.planner, 1, 0).result(None).outcome == "truncated"
 
 
