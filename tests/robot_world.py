@@ -262,6 +262,16 @@ class World:
 
         self.after(after_s, appear)
 
+    def lose_the_cloud_for_a_while(self) -> None:
+        """Have the cloud die in the task action of step 8, and come back 0.42 s later."""
+
+        def fault(performed: int) -> None:
+            if performed == 8 and not self.results:
+                self.kill("cloud")
+                self.bring_up("cloud", 0.42)
+
+        self.on_act = fault
+
     # -- running ---------------------------------------------------------------------------------
 
     def after(self, seconds: float, do: Callable[[], list[RobotEffect]]) -> None:

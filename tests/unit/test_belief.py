@@ -73,7 +73,7 @@ class TestMaking:
         assert belief.states.flags.c_contiguous
         assert belief.weights.tolist() == [0.5, 0.5]
         assert uniform_weights(3).tolist() == [1.0 / 3.0] * 3
-        assert not belief.weights.flags.writeable
+        assert not (belief.weights.flags.writeable or belief.states.flags.writeable)
 
     def test_weights_are_normalised(self) -> None:
         belief = Belief.weighted([[1.0], [2.0], [3.0]], [2.0, 0.0, 6.0])

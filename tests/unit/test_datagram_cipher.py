@@ -1,4 +1,5 @@
 import itertools
+from typing import TypeAlias
 
 import pytest
 from hypothesis import given
@@ -16,17 +17,17 @@ from holdfast.transport.datagram_cipher import (
     ReplayWindow,
 )
 
+Ends: TypeAlias = tuple[DatagramCipher, DatagramCipher]
+
 
 @pytest.fixture
-def ends() -> tuple[DatagramCipher, DatagramCipher]:
+def ends() -> Ends:
     keys = AssociationKeys.draw(7)
     return DatagramCipher(keys, service=False), DatagramCipher(keys, service=True)
 
 
 class TestSealing:
-    def test_what_one_end_seals_the_other_opens(
-        self, ends: tuple[DatagramCipher, DatagramCipher]
-    ) -> None:
+    def test_what_one_end_seals_the_other_opens(self, ends: Ends) -> None:
         for sender, receiver in itertools.permutations(ends):
             for message in (b"", b"a message", bytes(1000)):
                 datagram = sender.encrypt(message)
@@ -34,27 +35,23 @@ class TestSealing:
                 assert int.from_bytes(datagram[:4]) == 7
                 assert receiver.decrypt(datagram) == message
 
-    def test_a_message_cannot_be_read_in_it(
-        self, ends: tuple[DatagramCipher, DatagramCipher]
-    ) -> None:
+    def test_a_message_cannot_be_read_in_it(self, ends: Ends) -> None:
         robot, _ = ends
         assert b"a secret" not in robot.encrypt(b"a secret")
 
-    def test_in_any_order(self, ends: tuple[DatagramCipher, DatagramCipher]) -> None:
+    def test_in_any_order(self, ends: Ends) -> None:
         robot, service = ends
         datagrams = [robot.encrypt(b"%d" % k) for k in range(5)]
         for k in (3, 0, 4, 2, 1):
             assert service.decrypt(datagrams[k]) == b"%d" % k
         assert [service.decrypt(datagram) for datagram in datagrams] == [None] * 5
 
-    def test_it_cannot_be_reflected(self, ends: tuple[DatagramCipher, DatagramCipher]) -> None:
+    def test_it_cannot_be_reflected(self, ends: Ends) -> None:
         robot, service = ends
         assert robot.decrypt(robot.encrypt(b"mine")) is None
         assert service.decrypt(service.encrypt(b"mine")) is None
 
-    def test_each_changed_bit_and_each_missing_byte_is_noticed(
-        self, ends: tuple[DatagramCipher, DatagramCipher]
-    ) -> None:
+    def test_each_changed_bit_and_each_missing_byte_is_noticed(self, ends: Ends) -> None:
         robot, service = ends
         datagram = robot.encrypt(b"a message")
         for bit in range(8 * len(datagram)):
@@ -66,9 +63,7 @@ class TestSealing:
         assert service.decrypt(datagram + b"\0") is None
         assert service.decrypt(datagram) == b"a message"
 
-    def test_a_forged_counter_does_not_move_the_window(
-        self, ends: tuple[DatagramCipher, DatagramCipher]
-    ) -> None:
+    def test_a_forged_counter_does_not_move_the_window(self, ends: Ends) -> None:
         robot, service = ends
         datagram = robot.encrypt(b"genuine")
         forged = datagram[:4] + (100_000).to_bytes(4, "big") + datagram[8:]
@@ -76,9 +71,7 @@ class TestSealing:
         assert service.window.newest == -1
         assert service.decrypt(datagram) == b"genuine"
 
-    def test_other_keys_and_other_associations(
-        self, ends: tuple[DatagramCipher, DatagramCipher]
-    ) -> None:
+    def test_other_keys_and_other_associations(self, ends: Ends) -> None:
         robot, service = ends
         same_number = DatagramCipher(AssociationKeys.draw(7), service=True)
         keys = AssociationKeys.draw(8)
@@ -94,7 +87,7 @@ class TestSealing:
         assert other.decrypt(DatagramCipher(same_keys, service=False).encrypt(b"x")) is None
 
     def test_no_counter_is_used_beyond_the_bound(
-        self, ends: tuple[DatagramCipher, DatagramCipher], monkeypatch: pytest.MonkeyPatch
+        self, ends: Ends, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         robot, _ = ends
         monkeypatch.setattr(datagram_cipher, "MAX_DATAGRAMS", 3)
@@ -104,7 +97,7 @@ class TestSealing:
             robot.encrypt(b"")
 
     def test_none_beyond_the_bound_is_taken(
-        self, ends: tuple[DatagramCipher, DatagramCipher], monkeypatch: pytest.MonkeyPatch
+        self, ends: Ends, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         """An end that goes on all the same."""
         robot, service = ends

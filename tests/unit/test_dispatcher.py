@@ -7,8 +7,9 @@ from tests.robot_world import LOCAL, SmallService, World, answer_third_slowly, n
 
 from holdfast.errors import ServiceRefusedError
 from holdfast.protocol.effects import LogEvent
-from holdfast.protocol.messages import Busy, Refused, Reply, Request, TaskAnswer, encode
+from holdfast.protocol.messages import Busy, Progress, Refused, Reply, Request, TaskAnswer, encode
 from holdfast.protocol.robot_events import (
+    Act,
     Launch,
     RecoveryExited,
     Send,
@@ -63,6 +64,7 @@ def test_the_exit_of_a_local_service_is_logged_although_its_link_still_stands() 
     world.on_act = fault
     world.complete()
     assert world.reports("recovery_exited") == [{"reason": "signal 9"}]
+    assert [e["service"] for e in world.reports("service_vanished")] == ["cloud", LOCAL]
     assert len([e for _, e in world.trace if isinstance(e, Launch)]) == 2
 
 
@@ -170,6 +172,7 @@ def test_who_fails_in_its_sensing_part_leaves_the_rest_to_another_service() -> N
 def test_the_machine_sleeps_while_nothing_can_be_done() -> None:
     # The local service is up before the cloud was ever seen; World.run asserts the rest.
     world = World(launch="at_start")
+    assert any(isinstance(e, Launch) for e in World(launch="at_start").robot.start(0.0))
     world.launch_s = 0.1
     world.start(present=False)
     world.run()
@@ -188,6 +191,33 @@ def test_the_machine_sleeps_while_nothing_can_be_done() -> None:
     world.services["dying"].rule = lambda _: []
     world.complete()
     assert told
+
+
+def test_a_call_that_ends_once_another_service_has_answered_is_no_loss() -> None:
+    world = World(services=("prompt", "slow"))
+    timeout_s, slow = 1e-3 * world.offload.detection_timeout_ms, world.services["slow"]
+    slow.latency_s = (timeout_s + 0.01) / 8
+    slow.rule = lambda r: [Progress(r.number, False)] * 7 if nth(r) == 2 else None
+    world.services["prompt"].up = False
+    world.start(present=False)
+    world.bring_up("slow")
+    world.bring_up("prompt", timeout_s)
+    world.run()
+    world.assert_same_as_without_faults()
+    assert [sent.service for sent in world.sent[:3]] == ["slow", "slow", "prompt"]
+    assert not world.reports("service_suspected")
+
+
+def test_a_robot_that_nobody_answers_holds_once() -> None:
+    """Not before it waits: the actions that it had been given are performed."""
+    world = World(launch="never")
+    world.services["cloud"].latency_s = 0.03
+    world.lose_the_cloud_for_a_while()
+    world.complete()
+    held = [at for at, e in world.trace if isinstance(e, LogEvent) and e.name == "holding"]
+    acted = [at for at, e in world.trace if isinstance(e, Act) and e.step == 11]
+    assert len(held) == 1
+    assert held[0] > acted[0]
 
 
 def test_a_long_wait_is_told_although_the_service_shows_life() -> None:
@@ -221,6 +251,10 @@ def test_another_process_of_a_service_that_refused_for_good_is_asked() -> None:
         if isinstance(e, LogEvent) and e.fields.get("to") == "keep_alive"
     )
     assert {sent.service for sent in world.sent if sent.at > back_at} == {"cloud"}
+    appeared_at = [
+        at for at, e in world.trace if isinstance(e, LogEvent) and e.name == "service_appeared"
+    ][-1]
+    assert appeared_at in {sent.at for sent in world.sent}  # it need not wait for the next turn
 
 
 def test_the_same_process_behind_another_link_still_refuses() -> None:

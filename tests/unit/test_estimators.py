@@ -42,15 +42,6 @@ def draw(count: int, seed: int = 1, dimension: int = 3) -> tuple[FloatArray, Flo
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("name", ESTIMATORS)
 class TestWhatMakesNoDifference:
-    def test_threads(self, name: str, count: int) -> None:
-        """Here to the last bit."""
-        points, _ = draw(count)
-        weights = np.random.default_rng(6).exponential(size=(40, count))
-        one = estimation.entropy(points, weights, ESTIMATORS[name], threads=1)
-        for threads in (0, 2, 5):
-            other = estimation.entropy(points, weights, ESTIMATORS[name], threads=threads)
-            assert np.asarray(other).tobytes() == np.asarray(one).tobytes()
-
     def test_layout_of_the_arguments(self, name: str, count: int) -> None:
         points, weights = draw(count)
         expected = entropy(points, weights, ESTIMATORS[name])

@@ -761,8 +761,6 @@ class TestRefusals:
     def test_without_rosbags(
         self, place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        import sys
-
         place.run(PEG)
         monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
         said = place.export("--mcap", "run.mcap", code=2)

@@ -128,7 +128,12 @@ def test_what_is_settled_twice_is_not_owed() -> None:
 
 def test_patience_that_was_not_needed_is_given_back() -> None:
     """A local service that was silent once was given ever more time, for ever."""
-    detector = present_detector()
+    prompt, detector = present_detector(), present_detector()
+    prompt.extend_patience(2.0, 60.0)
+    prompt.asked(0.0)
+    prompt.heard(0.01)
+    prompt.answered()
+    assert prompt.deadline() == 0.26
     for _ in range(5):
         detector.extend_patience(2.0, 60.0)
     detector.asked(0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 import pytest
@@ -30,46 +31,34 @@ def collides(world: World, *state: float) -> bool:
     return bool(world.collides(np.array(state)))
 
 
-class TestDisc:
-    world = DiscWorld(0.5, [(0.0, 0.0, 2.0, 1.0)])
-
-    def test_beside_an_edge(self) -> None:
-        assert collides(self.world, 1.0, 1.49)
-        assert not collides(self.world, 1.0, 1.51)
-
-    def test_at_a_corner_the_distance_counts_not_the_bounding_box(self) -> None:
-        assert not collides(self.world, 2.4, 1.4)  # at distance 0.566
-        assert collides(self.world, 2.3, 1.3)  # at distance 0.424
-
-    def test_centre_inside(self) -> None:
-        assert collides(self.world, 1.0, 0.5)
-
-    def test_touching_is_free(self) -> None:
-        assert not collides(self.world, 1.0, 1.5)
-        assert not collides(self.world, -0.5, 0.5)
+DISC = DiscWorld(0.5, [(0.0, 0.0, 2.0, 1.0)])
+STANDING = RectangleWorld(1.0, 2.0, GROUND)
+BRICK = BoxWorld((1.0, 2.0, 3.0), [(-9.0, -9.0, -9.0, 9.0, 9.0, 0.0)])
 
 
-class TestRectangle:
-    world = RectangleWorld(1.0, 2.0, GROUND)
+@pytest.mark.parametrize(
+    ("world", "free", "colliding"),
+    [
+        (DISC, (1.0, 1.51), (1.0, 1.49)),  # beside an edge
+        (DISC, (2.4, 1.4), (2.3, 1.3)),  # at a corner: at distances 0.566 and 0.424
+        (DISC, (1.0, 1.5), (1.0, 0.5)),  # touching; with its centre inside
+        (DISC, (-0.5, 0.5), (-0.5 + 1e-9, 0.5)),
+        (STANDING, (123.0, 1.0, 0.0), (123.0, 1.0 - 1e-9, 0.0)),
+        (BRICK, (0.0, 0.0, 1.5, 0.0, 0.0, 0.0), (0.0, 0.0, 1.5 - 1e-9, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_touching_is_free(
+    world: World, free: tuple[float, ...], colliding: tuple[float, ...]
+) -> None:
+    assert not collides(world, *free)
+    assert collides(world, *colliding)
 
-    def test_touching_is_free(self) -> None:
-        assert not collides(self.world, 123.0, 1.0, 0.0)
 
-    def test_overlapping_by_little_collides(self) -> None:
-        assert collides(self.world, 123.0, 1.0 - 1e-9, 0.0)
-
-
-class TestBox:
-    def test_touching_is_free(self) -> None:
-        world = BoxWorld((1.0, 2.0, 3.0), [(-9.0, -9.0, -9.0, 9.0, 9.0, 0.0)])
-        assert not collides(world, 0.0, 0.0, 1.5, 0.0, 0.0, 0.0)
-        assert collides(world, 0.0, 0.0, 1.5 - 1e-9, 0.0, 0.0, 0.0)
-
-    def test_parallel_edges_separate_nothing(self) -> None:
-        # Without care, the cross product of parallel edges is a zero axis that "separates" all.
-        world = BoxWorld((1.0, 1.0, 1.0), [(-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)])
-        for angles in np.eye(3) * 0.7:
-            assert collides(world, 0.3, 0.2, 0.1, *angles)
+def test_parallel_edges_separate_nothing() -> None:
+    # Without care, the cross product of parallel edges is a zero axis that "separates" all.
+    world = BoxWorld((1.0, 1.0, 1.0), [(-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)])
+    for angles in np.eye(3) * 0.7:
+        assert collides(world, 0.3, 0.2, 0.1, *angles)
 
 
 def reference_move(
@@ -105,7 +94,8 @@ def reference_move(
     return result
 
 
-WORLDS: dict[str, tuple[World, FloatArray, FloatArray, FloatArray]] = {
+Case: TypeAlias = tuple[World, FloatArray, FloatArray, FloatArray]
+WORLDS: dict[str, Case] = {
     "disc": (
         DiscWorld(0.1, [(-FAR, -FAR, FAR, 0.0), (0.0, 0.0, 0.1, 5.0)]),
         np.array([-0.15, 0.15]),
@@ -128,14 +118,12 @@ WORLDS: dict[str, tuple[World, FloatArray, FloatArray, FloatArray]] = {
 
 
 @pytest.fixture(params=WORLDS)
-def case(request: pytest.FixtureRequest) -> tuple[World, FloatArray, FloatArray, FloatArray]:
+def case(request: pytest.FixtureRequest) -> Case:
     return WORLDS[request.param]
 
 
 class TestMove:
-    def test_equals_the_reference_bit_for_bit(
-        self, case: tuple[World, FloatArray, FloatArray, FloatArray]
-    ) -> None:
+    def test_equals_the_reference_bit_for_bit(self, case: Case) -> None:
         world, mean, deviation, action = case
         states, unplaced = world.draw_free(mean, deviation, 60, fresh().substream(9))
         assert unplaced == 0
@@ -145,9 +133,7 @@ class TestMove:
         expected = reference_move(world, states, actions, deviation, 1e-3, fresh())
         assert moved.tobytes() == expected.tobytes()
 
-    def test_a_particle_does_not_depend_on_the_others_or_on_threads(
-        self, case: tuple[World, FloatArray, FloatArray, FloatArray]
-    ) -> None:
+    def test_a_particle_does_not_depend_on_the_others_or_on_threads(self, case: Case) -> None:
         world, mean, deviation, action = case
         count = 5000  # above the kernel's threshold for threads
         states, _ = world.draw_free(mean, deviation, count, fresh())
@@ -283,6 +269,11 @@ class TestRefusals:
             self.world.move(np.ones((3, 2)), np.ones(3), np.ones(2), 1e-3, fresh())
         with pytest.raises(InvalidValueError, match="does not broadcast"):
             self.world.move(np.ones((3, 2)), np.ones((4, 2)), np.ones(2), 1e-3, fresh())
+        for states, actions in (((3, 2), (3, 2)), ((4, 5, 2), (3, 2)), ((3, 5, 2), (4, 2))):
+            with pytest.raises(InvalidValueError, match=r"must be \(3, n, 2\) and \(3, 2\)"):
+                self.world.move_each(
+                    np.ones(states), np.ones(actions), np.ones(2), 1e-3, [fresh()] * 3, 1
+                )
         with pytest.raises(InvalidValueError, match="standard_deviation"):
             self.world.move(np.ones((3, 2)), np.ones(2), np.ones(3), 1e-3, fresh())
         with pytest.raises(InvalidValueError, match="mean"):

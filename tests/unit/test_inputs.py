@@ -130,25 +130,6 @@ def test_a_suspect_sensor_is_no_lost_robot() -> None:
     assert kinds == [None, None, "sensor_suspect"]
 
 
-def test_what_has_begun() -> None:
-    """Any of an input, a step or an action that is in the journal alone."""
-
-    def begun(history: Trial) -> bool:
-        return history.begun
-
-    planner = Planner(PROBLEM, PLANNING)
-    assert not begun(Trial(planner, 1, 0))
-    history = Trial(planner, 1, 0)
-    sense(history, 0, None, 0.0)
-    assert begun(history)
-    history = Trial(planner, 1, 0)
-    history.pending = np.zeros(3)
-    assert begun(history)
-    history = Trial(planner, 1, 0)
-    history.state = history.state._replace(step=1)
-    assert begun(history)
-
-
 def test_what_a_record_has_shown() -> None:
     shown = encode_floats(np.zeros(1))
     assert not has_shown(Moved(0, None))

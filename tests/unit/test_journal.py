@@ -21,7 +21,7 @@ from holdfast.journal import journal as journal_module
 from holdfast.journal import journal_reader
 from holdfast.journal.journal import Journal
 from holdfast.journal.journal_file import Survives
-from holdfast.journal.journal_reader import UnfinishedTrial
+from holdfast.journal.journal_reader import JournalReader, UnfinishedTrial
 from holdfast.planning.inputs import ActingRecord, Moved, PausedRecord, Record, Sensed
 from holdfast.planning.outcome import Decisions, TrialResult
 
@@ -59,9 +59,14 @@ def result_of(trial: int) -> TrialResult:
     )
 
 
-def unfinished_of(path: Path) -> UnfinishedTrial | None:
-    with Journal.open(path) as journal:
-        return journal.unfinished()
+def unfinished_of(journal: JournalReader | Path) -> UnfinishedTrial:
+    """Return what is left of the unfinished trial, which there is."""
+    if isinstance(journal, Path):
+        with Journal.open(journal) as opened:
+            return unfinished_of(opened)
+    unfinished = journal.unfinished()
+    assert unfinished is not None
+    return unfinished
 
 
 @pytest.fixture
@@ -128,14 +133,11 @@ class TestSteps:
                 journal.append(TRIAL, [])
             journal.append(TRIAL, [PausedRecord()])
         with Journal.open(path) as journal:
-            unfinished = journal.unfinished()
-            assert unfinished is not None
+            unfinished = unfinished_of(journal)
             assert unfinished.trial == journal.unfinished_trial() == TRIAL
             assert unfinished.records == [*all_records(4), PausedRecord()]
             journal.append(TRIAL, records_of(4))
-        unfinished = unfinished_of(path)
-        assert unfinished is not None
-        assert unfinished.records == [*all_records(4), PausedRecord(), *records_of(4)]
+        assert unfinished_of(path).records == [*all_records(4), PausedRecord(), *records_of(4)]
 
     def test_a_finished_trial_has_no_steps(self, path: Path) -> None:
         with Journal.create(path, {}) as journal:
@@ -147,9 +149,7 @@ class TestSteps:
             with pytest.raises(InvalidValueError, match="trial 1 is finished"):
                 journal.append(1, records_of(0))
             journal.append(3, records_of(0))
-        unfinished = unfinished_of(path)
-        assert unfinished is not None
-        assert unfinished.records == records_of(0)
+        assert unfinished_of(path).records == records_of(0)
 
     def test_one_trial_at_a_time(self, path: Path) -> None:
         with Journal.create(path, {}) as journal:
@@ -157,9 +157,8 @@ class TestSteps:
             with pytest.raises(InvalidValueError, match=r"trial 3 is not finished .* 4 cannot"):
                 journal.append(TRIAL + 1, records_of(0))
             journal.add(result_of(0))
-            unfinished = journal.unfinished()
-            assert unfinished is not None
-            assert unfinished.records == records_of(0)
+            journal.append(TRIAL, records_of(1))
+            assert unfinished_of(journal).records == all_records(2)
 
     def test_a_journal_with_steps_is_not_empty(self, path: Path) -> None:
         with Journal.create(path, {}) as journal:
@@ -193,9 +192,7 @@ class TestSteps:
         done = subprocess.run(command, input="", capture_output=True, text=True, timeout=60)
         # Nothing is written after it, for nobody knows what of the file is on the disk.
         assert done.stdout.splitlines() == [f"{path}: cannot be written: File too large"] * 2
-        unfinished = unfinished_of(path)
-        assert unfinished is not None
-        assert unfinished.records == all_records(1)
+        assert unfinished_of(path).records == all_records(1)
 
     @pytest.mark.parametrize("replace", [False, True])
     def test_nothing_is_acted_on_that_nobody_finds(self, path: Path, replace: bool) -> None:
@@ -214,7 +211,6 @@ class TestProcesses:
     def test_kill_leaves_every_appended_record(self, killed: bytes, path: Path) -> None:
         path.write_bytes(killed)
         unfinished = unfinished_of(path)
-        assert unfinished is not None
         assert unfinished.trial == TRIAL
         assert unfinished.records == all_records(6)
         assert unfinished.is_complete
@@ -230,9 +226,7 @@ class TestProcesses:
         path.parent.chmod(0o500)
         try:
             with Journal.read(path) as journal:
-                unfinished = journal.unfinished()
-                assert unfinished is not None
-                assert unfinished.records == all_records(6)
+                assert unfinished_of(journal).records == all_records(6)
                 assert [each.trial for each in journal.results(with_decisions=True)] == [0, 1, 2]
                 with pytest.raises(OutputError, match="cannot be written"):
                     journal.add(result_of(7))
@@ -246,9 +240,7 @@ class TestProcesses:
             with pytest.raises(OutputError, match="another process is using this run"):
                 Journal.open(path)
             with Journal.read(path) as journal:
-                unfinished = journal.unfinished()
-                assert unfinished is not None
-                assert unfinished.records == all_records(2)
+                assert unfinished_of(journal).records == all_records(2)
             # To close the file has not given up the other's lock.
             with pytest.raises(OutputError, match="another process is using this run"):
                 Journal.open(path)
@@ -260,9 +252,7 @@ class TestProcesses:
             with Journal.read(path) as before:
                 journal.append(TRIAL, records_of(1))
                 journal.add(result_of(TRIAL), keep_steps=True)
-                unfinished = before.unfinished()
-                assert unfinished is not None
-                assert unfinished.records == all_records(1)
+                assert unfinished_of(before).records == all_records(1)
                 assert before.finished() == set()
 
     def test_a_fork_does_not_keep_the_lock(self, path: Path) -> None:
@@ -323,9 +313,7 @@ class TestRun:
         monkeypatch.setattr(journal_reader, "boot_id", lambda: now)
         with Journal.create(path, {}) as journal:
             journal.append(TRIAL, records_of(0))
-            state = journal.unfinished()
-            assert state is not None
-            assert not state.is_complete
+            assert not unfinished_of(journal).is_complete
 
     @pytest.mark.skipif(
         not Path("/proc/sys/kernel/random/boot_id").exists(), reason="the kernel names no boot"
@@ -334,24 +322,17 @@ class TestRun:
     def test_another_boot_is_found_out(self, path: Path, survives: Survives) -> None:
         with Journal.create(path, {}, survives=survives) as journal:
             journal.append(TRIAL, records_of(0))
-            unfinished = journal.unfinished()
-            assert unfinished is not None
-            assert unfinished.is_complete
+            assert unfinished_of(journal).is_complete
             journal.set_meta(steps_boot="another")
         with Journal.open(path) as journal:
-            unfinished = journal.unfinished()
-            assert unfinished is not None
-            assert unfinished.is_complete == (survives == "power_cut")
+            assert unfinished_of(journal).is_complete == (survives == "power_cut")
             # From here on it is this boot's.
             journal.append(TRIAL, records_of(1))
-            unfinished = journal.unfinished()
-            assert unfinished is not None
-            assert unfinished.is_complete
+            assert unfinished_of(journal).is_complete
 
     def test_what_begins_or_ends_a_trial_is_on_the_disk(
         self, path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        Journal.create(path, {}).close()
         calls: list[str] = []
         for name in ("fdatasync", "pwrite"):
             real = getattr(os, name)
@@ -361,6 +342,8 @@ class TestRun:
                 return real(*arguments)
 
             monkeypatch.setattr(os, name, call)
+        Journal.create(path, {}).close()
+        assert calls[-2:] == ["fdatasync", "pwrite"]
         for survives in ("process_crash", "power_cut"):
             with Journal.open(path, survives=survives) as journal:
                 trial = len(journal.finished())
@@ -383,14 +366,13 @@ class TestDamage:
     def outcome(path: Path, *, read: bool) -> list[Record] | str:
         try:
             with Journal.read(path) if read else Journal.open(path) as journal:
-                unfinished = journal.unfinished()
+                unfinished = unfinished_of(journal)
                 finished = {result.trial for result in journal.results(with_decisions=True)}
         except OutputError as error:
             assert str(error).startswith(f"{path}: ")
             assert "another directory" in str(error)
             return str(error)
         assert finished == {0, 1, 2}
-        assert unfinished is not None
         return unfinished.records
 
     @pytest.mark.parametrize("read", [False, True], ids=["resumed", "read"])
@@ -427,15 +409,13 @@ class TestDamage:
             path.write_bytes(before + tail[:size])
             for _ in range(2):
                 unfinished = unfinished_of(path)
-                assert unfinished is not None
                 assert unfinished.is_complete
+                assert path.stat().st_size == len(before) + (size if size == len(tail) else 0)
                 # Whole, it may as well be there: nobody was told that it is not.
                 assert unfinished.records == all_records(1 + (size == len(tail)))
             with Journal.open(path) as journal:
                 journal.append(TRIAL, records_of(5))
-            unfinished = unfinished_of(path)
-            assert unfinished is not None
-            assert unfinished.records[-3:] == records_of(5)
+            assert unfinished_of(path).records[-3:] == records_of(5)
 
     def test_frames_are_of_one_file_and_in_their_order(self, killed: bytes, path: Path) -> None:
         with Journal.create(path, {}) as journal:

@@ -41,12 +41,13 @@ class TestRestartPolicy:
     @pytest.mark.parametrize("begun_at", [0.0, 7.0])
     def test_a_long_life_makes_up_for_failures(self, begun_at: float) -> None:
         launches = RestartPolicy(RecoverySettings(relaunch_delay_ms=100.0))
+        assert launches.appeared(begun_at) is None  # it was there before
         launches.want(begun_at)
         launches.failed(begun_at)
         launches.begin(begun_at)
         launches.failed(begun_at)
         launches.begin(begun_at)
-        launches.appeared(begun_at + 1.0)
+        assert launches.appeared(begun_at + 1.0) == 1.0
         launches.ended(begun_at + 5.0)
         assert launches.is_due(begun_at + 5.0)  # at once, as after the first failure
 

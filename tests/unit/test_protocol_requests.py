@@ -69,6 +69,20 @@ def test_a_service_that_always_needs_the_state_is_given_up() -> None:
     assert len([sent for sent in world.sent if sent.service == "cloud"]) < 20
 
 
+def test_a_service_that_is_silent_for_ever_has_few_open_calls() -> None:
+    world = World()
+    most = 0
+
+    def fault(performed: int) -> None:
+        nonlocal most
+        world.services["cloud"].stopped = bool(world.results) or performed >= 4
+        most = max(most, list(world.calls.values()).count("cloud"))
+
+    world.on_act = fault
+    world.complete()
+    assert most == 4
+
+
 def test_a_state_that_came_out_otherwise_is_told() -> None:
     world = World()
     told: list[Request] = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import heapq
 from collections.abc import Callable, Iterator
 
 import msgspec
@@ -25,6 +24,7 @@ from holdfast.protocol.robot import Robot
 from holdfast.protocol.robot_events import (
     Act,
     Acted,
+    EndTrial,
     EnvironmentFailed,
     EnvironmentReady,
     Halt,
@@ -40,7 +40,7 @@ from holdfast.robot.trial import run_trial
 # -- the robot's own death ------------------------------------------------------------------------
 
 
-def recorded() -> tuple[list[tuple[Record, ...]], World]:
+def recorded() -> list[tuple[Record, ...]]:
     """Return what the journal held at each moment of a run without faults."""
     world = World(simulator=SimulatorSettings(num_trials=1, max_steps=14, seed=11))
     stages: list[tuple[Record, ...]] = [()]
@@ -55,7 +55,7 @@ def recorded() -> tuple[list[tuple[Record, ...]], World]:
 
     world.carry_out = watching  # type: ignore[method-assign]
     world.run()
-    return stages, world
+    return stages
 
 
 def test_what_earlier_processes_did_counts_in_the_result() -> None:
@@ -211,7 +211,7 @@ def test_what_comes_with_a_move_is_written_before_a_lost_robot_holds_still(lost_
 
 
 def test_an_unknown_performance_stops_unless_the_environment_can_tell() -> None:
-    stages, _ = recorded()
+    stages = recorded()
     pending = next(s for s in stages if s and isinstance(s[-1], ActingRecord) and len(s) > 6)
     known = len([r for r in pending if isinstance(r, Moved)])
     stopped = begin_after(pending, None).stopped
@@ -227,7 +227,7 @@ def test_an_unknown_performance_stops_unless_the_environment_can_tell() -> None:
 
 
 def test_a_tail_that_may_be_lost_stops_unless_the_environment_can_tell() -> None:
-    stages, _ = recorded()
+    stages = recorded()
     settled = next(s for s in stages if s and isinstance(s[-1], Sensed) and len(s) > 6)
     known = len([r for r in settled if isinstance(r, Moved)])
     assert begin_after(settled, None, tail_is_certain=True).stopped is None
@@ -236,41 +236,8 @@ def test_a_tail_that_may_be_lost_stops_unless_the_environment_can_tell() -> None
     assert begin_after(settled, known + 1, tail_is_certain=False).stopped is not None
 
 
-@pytest.mark.parametrize(
-    ("counts", "expected"), [(True, HeldError), (False, UnknownPerformanceError)]
-)
-def test_an_environment_that_fails_holds_the_robot(counts: bool, expected: type) -> None:
-    # One that counts can say later whether the action was performed; else nobody ever can.
-    world = World()
-    world.start()
-
-    def fail(step: int) -> None:
-        if step == 5:
-            world.heap.clear()
-            failure = EnvironmentFailed(5, "perform", "the arm is stuck", True, counts_steps=counts)
-            world.after(0.1, lambda: world.robot.handle(failure, world.now))
-
-    world.on_act = fail
-    act = world.act
-
-    def act_or_fail(effect: Act) -> None:
-        act(effect)
-        if effect.step == 5:
-            # What the environment would have delivered never comes.
-            world.heap = [item for item in world.heap if item[0] - world.now > 0.05]
-            heapq.heapify(world.heap)
-
-    world.act = act_or_fail  # type: ignore[method-assign]
-    world.run()
-    assert world.stopped is not None
-    assert type(world.stopped.error) is expected
-    assert str(world.stopped.error).endswith(": the arm is stuck")
-    assert ("steps_performed" in str(world.stopped.error)) is not counts
-    assert isinstance(world.journal[-1], ActingRecord)
-
-
-@pytest.mark.parametrize("counts", [True, False])
-def test_what_fails_after_an_action_was_performed_leaves_it_in_the_journal(counts: bool) -> None:
+def stopped_by(failure: EnvironmentFailed) -> tuple[World, Halt]:
+    """Return the machine of a robot whose environment fails in the task action of step 5."""
     world = World()
     world.start()
     act = world.act
@@ -278,15 +245,33 @@ def test_what_fails_after_an_action_was_performed_leaves_it_in_the_journal(count
     def act_and_fail(effect: Act) -> None:
         act(effect)
         if effect.step == 5:
-            failure = EnvironmentFailed(5, "is_done", "returned None", False, Acted(Moved(5, -2.5)))
-            world.heap = []
+            world.heap = []  # What the environment would have delivered never comes.
             world.after(0.1, lambda: world.robot.handle(failure, world.now))
 
     world.act = act_and_fail  # type: ignore[method-assign]
     world.run()
     assert world.stopped is not None
-    assert type(world.stopped.error) is HeldError
-    assert "step 5, whose task action was performed: returned None" in str(world.stopped.error)
+    return world, world.stopped
+
+
+@pytest.mark.parametrize(
+    ("counts", "expected"), [(True, HeldError), (False, UnknownPerformanceError)]
+)
+def test_an_environment_that_fails_holds_the_robot(counts: bool, expected: type) -> None:
+    # One that counts can say later whether the action was performed; else nobody ever can.
+    failure = EnvironmentFailed(5, "perform", "the arm is stuck", True, counts_steps=counts)
+    world, stopped = stopped_by(failure)
+    assert type(stopped.error) is expected
+    assert str(stopped.error).endswith(": the arm is stuck")
+    assert ("steps_performed" in str(stopped.error)) is not counts
+    assert isinstance(world.journal[-1], ActingRecord)
+
+
+def test_what_fails_after_an_action_was_performed_leaves_it_in_the_journal() -> None:
+    failure = EnvironmentFailed(5, "is_done", "returned None", False, Acted(Moved(5, -2.5)))
+    world, stopped = stopped_by(failure)
+    assert type(stopped.error) is HeldError
+    assert "step 5, whose task action was performed: returned None" in str(stopped.error)
     assert world.journal[-1] == Moved(5, -2.5)
     # The effects come in this order: what is to be written down is, before the robot stops.
     resumed = begin_after(tuple(world.journal), None)
@@ -398,7 +383,7 @@ class TestUnexplainedObservations:
         first.environment_class = Lying
         first.on_act = lambda step: setattr(first, "ended", step == 10)
         first.start_and_run()
-        assert len(first.reports("unexplained")) == 3
+        assert len(first.reports("unexplained")) == first.robot.unexplained_observations == 3
         assert not first.reports("lost")
         second = self.world(set(range(20)), 8, tuple(first.journal[:-1]))
         assert [lost["step"] for lost in second.reports("lost")] == [4 * 4]
@@ -406,18 +391,9 @@ class TestUnexplainedObservations:
         assert second.results[0].unexplained_observations == 8
 
 
-def lose_the_cloud_for_a_while(world: World) -> None:
-    def fault(performed: int) -> None:
-        if performed == 8 and not world.results:
-            world.kill("cloud")
-            world.bring_up("cloud", 0.42)
-
-    world.on_act = fault
-
-
 def test_rate_paces_the_steps_and_counts_missed_ticks() -> None:
     world = World(rate_hz=20.0, launch="never")
-    lose_the_cloud_for_a_while(world)
+    world.lose_the_cloud_for_a_while()
     world.complete()
     times = [at for at, e in world.trace if isinstance(e, Act)][:20]
     gaps = np.diff(times)
@@ -425,6 +401,9 @@ def test_rate_paces_the_steps_and_counts_missed_ticks() -> None:
     assert 3 <= world.robot.missed_ticks <= 6
     reported = sum(int(str(f["missed"])) for f in world.reports("missed_ticks"))
     assert reported == world.robot.missed_ticks
+    told = next(at for at, e in world.trace if isinstance(e, LogEvent) and e.name == "missed_ticks")
+    ended = next(at for at, e in world.trace if isinstance(e, EndTrial))
+    assert told < ended  # as soon as they are missed
 
 
 def test_a_robot_that_takes_its_task_actions_itself_waits_at_sensing_steps_alone() -> None:
@@ -440,7 +419,7 @@ def test_a_robot_that_takes_its_task_actions_itself_waits_at_sensing_steps_alone
             yield each
 
     cloud.answer = lies  # type: ignore[method-assign,assignment]
-    lose_the_cloud_for_a_while(world)
+    world.lose_the_cloud_for_a_while()
     world.complete()
     timings = [e for _, e in world.trace if isinstance(e, Timing)]
     assert {(e.service, e.waited_ms) for e in timings if e.kind == "task"} == {(OWN_PLANNER, 0.0)}

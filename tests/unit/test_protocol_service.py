@@ -18,7 +18,6 @@ import pytest
 from tests.questions import received, request_of
 
 from holdfast.config import registry
-from holdfast.config.registry import BUILT_IN
 from holdfast.config.source_digest import core_version, problem_digest
 from holdfast.errors import (
     ConfigurationError,
@@ -64,9 +63,6 @@ from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffec
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast.protocol.service_sessions import SHORT_S
 from holdfast.robot.environment import SimulatedEnvironment
-
-PROBLEMS = tuple(BUILT_IN)
-
 
 CODE = core_version(), problem_digest(object)
 """Digests of a problem that is one of holdfast's."""
@@ -148,6 +144,14 @@ class Bench:
         self.run_all()
         assert call in self.ended
         return self.replies[call]
+
+    def assert_right(self, robot: Robot, request: Request) -> None:
+        assert content(self.ask(request)) == robot.right_answer()
+
+    def assert_refused(self, request: Request, code: str, *words: str) -> None:
+        reply = refused(self.ask(request))
+        assert reply.code == code
+        assert all(each in reply.text for each in words), reply.text
 
     def known(self, *keys: int, owner: str | None = None) -> list[Robot]:
         """Return robots that were served, and have sensed since."""
@@ -289,9 +293,7 @@ class TestRollingForward:
             robot.act_until_sensing()
         request = robot.request(since=1)
         assert bench.ask(request) == [NeedState(request.number, differs=False)]
-        assert (
-            content(bench.ask(robot.restore(session_configuration=False))) == robot.right_answer()
-        )
+        bench.assert_right(robot, robot.restore(session_configuration=False))
 
     def test_robot_that_is_behind(self) -> None:
         bench, robot = Bench(), Robot()
@@ -304,7 +306,7 @@ class TestRollingForward:
         robot.state, robot.observed = behind
         request = robot.request(session_configuration=False, since=1)
         assert bench.ask(request) == [NeedState(request.number, differs=True)]
-        assert content(bench.ask(robot.restore())) == robot.right_answer()
+        bench.assert_right(robot, robot.restore())
         assert bench.service.statistics.states_diverged == 0, "it only is where it was before"
 
     def test_other_digest(self) -> None:
@@ -322,10 +324,7 @@ class TestRollingForward:
         told = [note.fields for note in bench.notes if note.name == "state_diverged"]
         assert [(each["trial"], each["step"]) for each in told] == [(0, robot.state.step)]
         # The state from before is still there.
-        assert (
-            content(bench.ask(robot.request(session_configuration=False, since=1)))
-            == robot.right_answer()
-        )
+        bench.assert_right(robot, robot.request(session_configuration=False, since=1))
 
     def test_far_ahead_of_what_is_bearable(self) -> None:
         bench, robot = Bench(max_steps=100), Robot(planning=planning_of(10**6))
@@ -338,28 +337,23 @@ class TestRollingForward:
 
     @pytest.mark.parametrize(
         ("changes", "name"),
-        [({"step": 5}, "step"), ({"trial": 1}, "trial"), ({"sensed": False, "step": 1}, "step")],
+        [
+            ({"step": 5}, "step"),
+            ({"trial": 1}, "trial"),
+            ({"sensed": False, "step": 1}, "step"),
+            ({"digest": bytes(16)}, ""),
+            ({"checkpoint": b"rubbish"}, ""),
+            (
+                {"checkpoint": encode_checkpoint(Robot(planning=planning_of(particles=30)).state)},
+                "30 particles",
+            ),
+        ],
+        ids=["step", "trial", "sensed", "digest", "rubbish", "size"],
     )
     def test_checkpoint_of_another_state(self, changes: dict[str, Any], name: str) -> None:
         bench, robot = Bench(), Robot()
         robot.sense()
-        reply = refused(bench.ask(robot.restore(**changes)))
-        assert reply.code == "invalid"
-        assert name in reply.text
-
-    def test_checkpoint_with_another_digest(self) -> None:
-        bench, robot = Bench(), Robot()
-        assert refused(bench.ask(robot.restore(digest=bytes(16)))).code == "invalid"
-
-    def test_checkpoint_of_another_size(self) -> None:
-        bench, robot, other = Bench(), Robot(), Robot(planning=planning_of(particles=30))
-        reply = refused(bench.ask(robot.restore(checkpoint=encode_checkpoint(other.state))))
-        assert reply.code == "invalid"
-        assert "30 particles" in reply.text
-
-    def test_checkpoint_that_is_none(self) -> None:
-        bench, robot = Bench(), Robot()
-        assert refused(bench.ask(robot.restore(checkpoint=b"rubbish"))).code == "invalid"
+        bench.assert_refused(robot.restore(**changes), "invalid", name)
 
 
 class TestOnce:
@@ -381,7 +375,7 @@ class TestOnce:
         bench, robot = Bench(), Robot()
         robot.sense()
         bench.ask(robot.request())
-        assert refused(bench.ask(robot.request(step=1, sensed=False))).code == "invalid"
+        bench.assert_refused(robot.request(step=1, sensed=False), "invalid")
 
     def test_prefetch_that_was_dropped_is_taken_up_again(self) -> None:
         bench = Bench()
@@ -431,7 +425,7 @@ class TestEpochs:
         bench, robot = Bench(), Robot()
         bench.ask(robot.request())
         robot.session_configuration = msgspec.structs.replace(robot.session_configuration, seed=99)
-        assert refused(bench.ask(robot.request())).code == "invalid"
+        bench.assert_refused(robot.request(), "invalid")
 
     def test_other_settings_under_a_higher_epoch(self) -> None:
         bench, robot = Bench(), Robot()
@@ -439,7 +433,7 @@ class TestEpochs:
         robot.session_configuration = msgspec.structs.replace(robot.session_configuration, seed=99)
         robot.epoch = 2
         robot.begin(0)
-        assert content(bench.ask(robot.request())) == robot.right_answer()
+        bench.assert_right(robot, robot.request())
 
 
 class BrokenProblem(CapsuleRobot):
@@ -525,11 +519,9 @@ class TestRefusals:
         bench.run_all()
         assert content(bench.replies[call]) == sound.right_answer()
         sound.sense()
-        assert (
-            content(bench.ask(sound.request(session_configuration=False))) == sound.right_answer()
-        )
+        bench.assert_right(sound, sound.request(session_configuration=False))
         # It is not computed from what is left of the failed attempt.
-        assert refused(bench.ask(broken.request())).code == code
+        bench.assert_refused(broken.request(), code)
 
     def test_sensing_part_that_fails_leaves_the_task_part(self) -> None:
         problem = CapsuleRobot()
@@ -549,22 +541,17 @@ class TestRefusals:
             )
 
         bench = Bench(make)
-        reply = refused(bench.ask(Robot().request()))
-        assert reply.code == "unknown_problem"
-        assert "this and that" in reply.text
+        bench.assert_refused(Robot().request(), "unknown_problem", "this and that")
         statistics = bench.service.statistics
         assert statistics.refusals == {"unknown_problem": 1}
         counted = statistics.sessions, statistics.sessions_opened, statistics.sessions_evicted
         assert counted == (0, 0, 0)
 
     def test_a_problem_is_not_lent_to_a_robot_with_other_code(self) -> None:
-        def make(session_configuration: SessionConfiguration) -> Problem:
-            if (session_configuration.core_version, session_configuration.problem_digest) != (
-                "1",
-                "2",
-            ):
+        def make(asked: SessionConfiguration) -> Problem:
+            if (asked.core_version, asked.problem_digest) != ("1", "2"):
                 raise OtherCodeError("deploy the same version")
-            return make_problem(session_configuration)
+            return make_problem(asked)
 
         bench = Bench(make)
         session_configuration = msgspec.structs.replace(
@@ -572,55 +559,43 @@ class TestRefusals:
         )
         robot = Robot(key=1)
         robot.session_configuration = session_configuration
-        assert content(bench.ask(robot.request())) == robot.right_answer()
+        bench.assert_right(robot, robot.request())
         for key, changes in ((2, {"core_version": "0"}), (3, {"problem_digest": "0"})):
             other = Robot(key=key)
             other.session_configuration = msgspec.structs.replace(session_configuration, **changes)
-            assert refused(bench.ask(other.request())).code == "other_code"
+            bench.assert_refused(other.request(), "other_code")
 
     def test_model_that_does_not_fit(self) -> None:
         def make(session_configuration: SessionConfiguration) -> Problem:
             raise ConfigurationError("model.robot_radius is -1")
 
-        assert refused(Bench(make).ask(Robot().request())).code == "invalid"
+        Bench(make).assert_refused(Robot().request(), "invalid")
 
     def test_too_many_particles(self) -> None:
         bench, robot = Bench(max_particles=10), Robot()
-        reply = refused(bench.ask(robot.request()))
-        assert reply.code == "invalid"
-        assert "particle_filter.num_particles 20" in reply.text
-        assert "10 (max_particles)" in reply.text
+        words = "particle_filter.num_particles 20", "10 (max_particles)"
+        bench.assert_refused(robot.request(), "invalid", *words)
         assert bench.service.statistics.sessions == 0
 
     def test_too_much_work(self) -> None:
         bench, robot = Bench(max_decision_s=0.002), Robot()
         bench.ask(robot.request())  # leaves the problem, ready built
+        words = "num_observation_samples 1000", "at most 0.002 s (--max-decision-s)"
         for key, problem in ((2, "capsule_robot"), (3, "peg_in_hole_2d")):
             greedy = Robot(problem, planning_of(num_observation_samples=1000), key=key)
-            reply = refused(bench.ask(greedy.request()))
-            assert reply.code == "invalid"
-            assert "num_observation_samples 1000" in reply.text
-            assert "at most 0.002 s (--max-decision-s)" in reply.text
+            bench.assert_refused(greedy.request(), "invalid", *words)
 
     def test_settings_that_do_not_fit_the_problem(self) -> None:
-        bench = Bench()
         robot = Robot(planning=planning_of(num_nearest_neighbors=3))
         robot.session_configuration = msgspec.structs.replace(
             robot.session_configuration, planning=planning_of(num_nearest_neighbors=20)
         )
-        reply = refused(bench.ask(robot.request()))
-        assert reply.code == "invalid"
-        assert "num_nearest_neighbors is 20" in reply.text
-
-    def test_observation_of_the_wrong_size(self) -> None:
-        bench, robot = Bench(), Robot()
-        robot.sense()
-        wrong = Sensed(0, 0, encode_floats(np.zeros(7)))
-        assert refused(bench.ask(robot.request(inputs=(wrong,)))).code == "invalid"
+        Bench().assert_refused(robot.request(), "invalid", "num_nearest_neighbors is 20")
 
     @pytest.mark.parametrize(
         ("observed", "code"),
         [
+            (Sensed(0, 0, encode_floats(np.zeros(7))), "invalid"),
             (Sensed(0, 10**6, encode_floats(np.zeros(1))), "invalid"),
             (Sensed(0, 0, b"123"), "malformed"),
             (Sensed(0, 0, encode_floats([np.nan])), "malformed"),
@@ -629,12 +604,10 @@ class TestRefusals:
     def test_observation_that_is_none(self, observed: Sensed, code: str) -> None:
         bench, robot = Bench(), Robot()
         robot.sense()
-        assert refused(bench.ask(robot.request(inputs=(observed,)))).code == code
+        bench.assert_refused(robot.request(inputs=(observed,)), code)
 
     def test_other_version(self) -> None:
-        bench, robot = Bench(), Robot()
-        reply = refused(bench.ask(robot.request(version=99)))
-        assert reply.code == "version"
+        Bench().assert_refused(Robot().request(version=99), "version")
 
 
 class TestCapacity:
@@ -726,10 +699,7 @@ class TestCapacity:
         assert (statistics.sessions_opened, statistics.sessions_evicted) == (3, 1)
         request = robots[1].request(session_configuration=False)
         assert bench.ask(request) == [NeedState(request.number, differs=False)]
-        assert (
-            content(bench.ask(robots[0].request(session_configuration=False)))
-            == robots[0].right_answer()
-        )
+        bench.assert_right(robots[0], robots[0].request(session_configuration=False))
 
     def test_no_room_is_not_asked_for_again_at_once(self) -> None:
         bench = Bench(max_sessions=2, max_waiting=1000, max_wait_ms=1e6)
@@ -770,10 +740,7 @@ class TestCapacity:
             bench.ask(robot.request())
             assert bench.service.statistics.state_bytes <= 5 * size
         assert bench.service.statistics.sessions == 2
-        assert (
-            content(bench.ask(robots[-1].request(session_configuration=False)))
-            == robots[-1].right_answer()
-        )
+        bench.assert_right(robots[-1], robots[-1].request(session_configuration=False))
 
     def test_requests_that_wait_hold_no_opening(self) -> None:
         bench = Bench()

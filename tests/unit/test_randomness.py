@@ -185,6 +185,8 @@ class TestGoingOn:
         )
         every = [*moved, *drawn, *each, own.normal((5, 2)), own.normal((5, 2))]
         assert len(np.unique(every)) == np.size(every)
+        to = world.move(still, np.ones(2), 0.0 * deviation, 1e-3, NOISE_FREE)
+        np.testing.assert_array_equal(to, np.ones((5, 2)))
         # A draw before does not change the first motion.
         other = named()
         other.normal(3)
@@ -248,6 +250,7 @@ class TestParameters:
         found = named().uniform(-1.0, [1.0, 2.0, 3.0], (4, 3))
         assert found.tobytes() == (-1.0 + np.array([2.0, 3.0, 4.0]) * standard).tobytes()
         assert named().uniform(high=np.array([2.0, 4.0])).shape == (2,)
+        assert named().uniform(2.0, 2.0) == 2.0
         found = named().uniform(low=[-1.0, 0.0])
         expected = np.array([-1.0, 0.0]) + np.array([2.0, 1.0]) * named().random(2)
         assert found.tobytes() == expected.tobytes()
@@ -398,7 +401,7 @@ class TestWithoutNoise:
     def test_it_does_not_end(self) -> None:
         NOISE_FREE.end()
         assert NOISE_FREE.normal() == 0.0
-        assert NOISE_FREE.anew() is NOISE_FREE
+        assert NOISE_FREE.anew() is NOISE_FREE.lent() is NOISE_FREE
 
     @pytest.mark.parametrize("kind", ["normal", "random", "standard_normal", "uniform"])
     def test_who_waits_for_another_number_is_told(self, kind: str) -> None:

@@ -96,6 +96,7 @@ def test_pauses_grow_to_a_second_and_end_with_both_parts() -> None:
     for sensing in (False, True):
         service.note_refusal("busy", "no", 20.0, sensing=sensing)
     assert told(service) == "busy: no"
+    service.detector.suspect("it was silent")
     service.note_answer(question_at(0), 20.5, sensing=True, restored=False)
     assert service.usable(20.5)
     assert (service.backoff_s, service.num_refusals) == (1.0, [1, 0])

@@ -278,6 +278,11 @@ def list_of(serials: list[int], *, number: int | None, until: bool) -> bytes:
 SPECIMEN = x509.load_pem_x509_crl(list_of([5, 7], number=1, until=True)).public_bytes(Encoding.DER)
 
 
+def pem_of(der: bytes) -> bytes:
+    head, tail = b"-----BEGIN X509 CRL-----\n", b"-----END X509 CRL-----\n"
+    return head + base64.encodebytes(der) + tail
+
+
 class TestReading:
     @given(
         st.lists(st.integers(1, 2**159 - 1), max_size=40, unique=True),
@@ -304,15 +309,26 @@ class TestReading:
             at = data.draw(st.integers(0, len(der) - 1))
             der[at] = data.draw(st.integers(0, 255))
         cut = data.draw(st.integers(0, len(der)))
-        content = base64.encodebytes(bytes(der[:cut]))
         path = tmp_path_factory.getbasetemp() / "damaged.pem"
-        path.write_bytes(b"-----BEGIN X509 CRL-----\n" + content + b"-----END X509 CRL-----\n")
+        path.write_bytes(pem_of(bytes(der[:cut])))
         try:
             read = revoked_serials(path)
         except TransportError as error:
             assert "revocation list" in str(error)
         else:
             assert all(isinstance(serial, int) for serial in read)
+
+    def test_malformed_values_are_named(self, tmp_path: Path) -> None:
+        path, left = tmp_path / REVOKED_FILE, len(SPECIMEN) - 4
+        for der, says in (
+            (SPECIMEN[:-1], f"a value of {left + 1} bytes where {left} are left"),
+            (b"\x31" + SPECIMEN[1:], "a value with the tag 0x31 where 0x30 belongs"),
+            (b"\x30\x85" + SPECIMEN, "a length of 5 bytes"),
+            (b"\x30\x80" + SPECIMEN, "a length of 0 bytes"),
+        ):
+            path.write_bytes(pem_of(der))
+            with pytest.raises(TransportError, match=f"is a malformed revocation list: {says}"):
+                revoked_serials(path)
 
     def test_no_file_is_an_empty_list(self, tmp_path: Path) -> None:
         assert revoked_serials(tmp_path / REVOKED_FILE) == frozenset()

@@ -17,7 +17,13 @@ from holdfast.numerics.randomness import Purpose, Stream, stream
 from holdfast.planning.belief import Belief
 from holdfast.planning.estimators import GaussianMixture, NearestNeighbor, PriorNeighbors, entropy
 from holdfast.planning.sensing import SensingInfo, choose_sensing_action
-from holdfast.planning.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
+from holdfast.planning.settings import (
+    FEW_PARTICLES,
+    ActiveSensingSettings,
+    Estimator,
+    PlanningSettings,
+    SelectorSettings,
+)
 from holdfast.problems.problem import Problem, ProblemBase
 
 HYPOTHESES = stream(41, 0, 0, Purpose.HYPOTHESES)
@@ -58,7 +64,7 @@ class Coordinates(ProblemBase):
         return np.asarray((np.abs(states) < 0.1).all(axis=-1))
 
 
-def settings_of(selector: SelectorSettings | None = None, **sensing: int) -> PlanningSettings:
+def settings_of(selector: SelectorSettings | None = None, **sensing: float) -> PlanningSettings:
     active_sensing = msgspec.structs.replace(ActiveSensingSettings(num_cores=1), **sensing)
     return PlanningSettings(
         active_sensing=active_sensing,
@@ -78,6 +84,12 @@ def choose(
     return choose_sensing_action(problem, settings, belief, stage, HYPOTHESES, SELECTION)
 
 
+def entropies(problem: Problem, settings: PlanningSettings, belief: Belief) -> FloatArray:
+    found = choose(problem, settings, belief)[1].entropies
+    assert found is not None
+    return found
+
+
 class TestWhatIsChosen:
     @pytest.mark.parametrize(
         ("rows", "expected"), [([0, 0, 0], 0), ([1, 0, 0, 1], 1), ([1, 1, 0, 0], 2), ([0, 1, 0], 0)]
@@ -90,6 +102,31 @@ class TestWhatIsChosen:
             assert info.entropies[j] == info.entropies[rows.index(row)]
         assert index == expected
 
+    @pytest.mark.parametrize("horizon", [1, 3])
+    def test_the_same_resolution_for_each_coordinate(self, horizon: int) -> None:
+        found = []
+        for resolution in (0.1, (0.1, 0.1)):
+            selector = SelectorSettings(
+                method="action_entropy", estimator="nearest_neighbor", resolution=resolution
+            )
+            settings = settings_of(selector, horizon=horizon, discount=0.5)
+            found.append(choose(Coordinates(), settings, belief_of(2.0, 0.2))[1])
+        for own, other in zip(*(each[:2] for each in found), strict=True):
+            np.testing.assert_allclose(own, other, rtol=1e-12)
+
+    @pytest.mark.parametrize(
+        ("count", "estimator"),
+        [(FEW_PARTICLES, "prior_neighbors"), (FEW_PARTICLES + 1, "nearest_neighbor")],
+    )
+    def test_few_particles_have_an_estimator_of_their_own(
+        self, count: int, estimator: Estimator
+    ) -> None:
+        belief, found = belief_of(2.0, 0.2, count=count), []
+        for given in (None, estimator):
+            selector = SelectorSettings(method="path_entropy", estimator=given)
+            found.append(entropies(Coordinates(), settings_of(selector), belief).tolist())
+        assert found[0] == found[1]
+
 
 class TestBlindChoices:
     def test_fixed(self) -> None:
@@ -100,11 +137,15 @@ class TestBlindChoices:
             assert chosen == index
             assert info == SensingInfo(None, None, 0, 0)
 
-    @pytest.mark.parametrize("count", [1, 2, 3, 7])
-    def test_random_is_uniform(self, count: int) -> None:
-        """Chi-square at 1e-6 over 7,000 steps, and no memory from one step to the next."""
-        problem = Coordinates([0] * count)
-        settings = settings_of(SelectorSettings(method="random"))
+    @pytest.mark.parametrize(("count", "optional"), [(1, False), (2, False), (3, True), (7, False)])
+    def test_random_is_uniform(self, count: int, optional: bool) -> None:
+        """Chi-square at 1e-6 over 7,000 steps, and no memory from one step to the next.
+
+        If sensing is optional, not to sense is one of the choices.
+        """
+        problem = Coordinates([0] * (count - optional))
+        selector = SelectorSettings(method="random", sensing_is_optional=optional)
+        settings = settings_of(selector)
         belief = belief_of(1.0, 1.0)
         steps = 7000
         chosen = np.array(
@@ -192,22 +233,20 @@ class TestNotSensing:
         estimator: NearestNeighbor | GaussianMixture | PriorNeighbors,
     ) -> None:
         belief = unequal(belief_of(1.0, 2.0))
-        _, info = choose(Coordinates(), settings_of(optional(selector)), belief)
-        assert info.entropies is not None
+        found = entropies(Coordinates(), settings_of(optional(selector)), belief)
         expected = entropy(-belief.states, belief.weights, estimator)
-        np.testing.assert_allclose(info.entropies[2], expected, rtol=1e-13)
+        np.testing.assert_allclose(found[2], expected, rtol=1e-13)
 
     def test_path_entropy_adds_up_those_along_the_path(self) -> None:
         belief = belief_of(1.0, 2.0)
-        _, info = choose(Coordinates(), settings_of(optional(OPTIONAL[3])), belief)
-        assert info.entropies is not None
+        found = entropies(Coordinates(), settings_of(optional(OPTIONAL[3])), belief)
         # Without limits all particles are at the goal after a step, and there every action is 0.
         estimator = PriorNeighbors(belief.weights, 5, 0.1)
         now, later = (
             entropy(points, belief.weights, estimator)
             for points in (-belief.states, np.zeros((60, 2)))
         )
-        np.testing.assert_allclose(info.entropies[2], now + 0.5 * later, rtol=1e-13)
+        np.testing.assert_allclose(found[2], now + 0.5 * later, rtol=1e-13)
 
     @pytest.mark.parametrize("selector", OPTIONAL)
     @pytest.mark.parametrize("kind", [Nothing, GeneralNothing])
@@ -237,24 +276,6 @@ class TestNotSensing:
             assert choose(Coordinates([0], variance=0.1), settings, spread)[0] == 0
         for selector in OPTIONAL[:4]:
             assert choose(Coordinates([0, 1]), settings_of(optional(selector)), alike)[0] == 2
-
-    def test_random_draws_among_all_choices(self) -> None:
-        """Chi-square at 1e-6 over 6,000 steps."""
-        settings = settings_of(optional(SelectorSettings(method="random")))
-        chosen = [
-            choose_sensing_action(
-                Coordinates(),
-                settings,
-                belief_of(1.0, 1.0),
-                0,
-                HYPOTHESES,
-                stream(43, 0, step, Purpose.SELECTION),
-            )[0]
-            for step in range(6000)
-        ]
-        observed = np.bincount(chosen)
-        assert len(observed) == 3
-        assert stats.chisquare(observed).pvalue > 1e-6
 
     def test_fixed_may_name_it_only_where_sensing_is_optional(self) -> None:
         belief = belief_of(1.0, 1.0)
@@ -346,6 +367,14 @@ class TestBadInput:
             with pytest.raises(ProblemError, match=rf"policy of coordinates returned \[.*{bad}\]"):
                 choose(Broken(policy=actions), settings_of(selector), belief)
 
+    def test_policy_of_a_predicted_state_out_of_bounds(self) -> None:
+        class Far(Coordinates):
+            def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+                return np.full(states.shape, 1e160)
+
+        with pytest.raises(ProblemError, match=r"returned \[-1\.e.*in the predicted state \[1\.e"):
+            choose(Far(), settings_of(horizon=2), belief_of(1.0, 1.0))
+
     @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
     def test_observation_mean_not_finite(self, bad: float) -> None:
         mean = np.zeros((60, 1))
@@ -404,11 +433,8 @@ class TestBadInput:
         problem: Problem, first: SelectorSettings, second: SelectorSettings
     ) -> None:
         belief = belief_of(1.0, 1.0)
-        _, one = choose(problem, settings_of(first), belief)
-        _, other = choose(problem, settings_of(second), belief)
-        assert one.entropies is not None
-        assert other.entropies is not None
-        assert one.entropies.tolist() == other.entropies.tolist()
+        one, other = (entropies(problem, settings_of(each), belief) for each in (first, second))
+        assert one.tolist() == other.tolist()
 
     def test_mixture_of_a_negative_motion_variance(self) -> None:
         class Wrong(Coordinates):
@@ -451,6 +477,7 @@ class TestBadInput:
             assert info.entropies is not None
             found.append((chosen, info.entropies.tobytes(), info.likelihoods))
             calls.append((len(asked), sum(asked)))
+            assert info.likelihoods == 60 * sum(asked)
         assert found[0] == found[1] == found[2]
         samples = settings.active_sensing.num_observation_samples
         assert calls[0] == calls[2] == (sum(asked), sum(asked))

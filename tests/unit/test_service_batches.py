@@ -81,6 +81,7 @@ def test_which_are_alike() -> None:
     one, other = bench.jobs
     assert one.is_like(other)
     assert list(run_together([one])) == []
+    assert list(run_together([one, other])) == [one, other]
     bench.run()
     sensing = bench.jobs[-1]
     assert sensing.kind == "sensing"

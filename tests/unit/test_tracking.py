@@ -102,7 +102,7 @@ def test_what_is_awaited_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert trial.awaited == (6,)
     with pytest.raises(RecordError, match="of step 0, where none is awaited"):
         come_late(trial, 0, np.array([0.2]))
-    come_late(trial, 6, np.array([0.2]))
+    assert come_late(trial, 6, np.array([0.2])).digest == bits(trial)
 
 
 def test_not_to_sense_awaits_nothing() -> None:
@@ -184,6 +184,8 @@ def test_the_log_has_what_was_shown() -> None:
     acted(plain)
     acted(shown, motion=np.array([0.1]))
     assert [len(trial.log.decisions().log) for trial in (plain, shown)] == [45 + 17, 45 + 17 + 41]
+    begin_anew(shown)
+    assert len(shown.log.decisions().log) == 45 + 17 + 41 + 41
     assert plain.result(None).digest != shown.result(None).digest
     assert len(list(shown.log.decisions())) == 2
 
@@ -192,7 +194,7 @@ def test_the_log_has_what_was_shown() -> None:
 def test_the_result_has_the_ending(outcome: Any) -> None:
     trial = Trial(Planner(Cart(), SETTINGS), 1, 0)
     result = trial.result(Ending(outcome, "hit the wall"))
-    assert (result.outcome, result.reason) == (outcome, "hit the wall")
+    assert (result.outcome, result.reason, result.reward) == (outcome, "hit the wall", 0.0)
     assert Trial(trial.planner, 1, 0).result(None).outcome == "truncated"
 
 
@@ -234,13 +236,14 @@ def test_the_account_of_a_trial() -> None:
     problem = Cart()
     trial = Trial(Planner(problem, PlanningSettings(sensing_interval=0)), 1, 0)
     counts = [(trial.num_sensed, trial.num_inputs, trial.num_unexplained)]
-    far = np.array([1e3])
+    far, begun_before = np.array([1e3]), trial.begun
 
     def note() -> None:
         counts.append((trial.num_sensed, trial.num_inputs, trial.num_unexplained))
 
     sense(trial, 0, far, 2.0)
     note()
+    assert (begun_before, trial.begun) == (False, True)
     move(trial, np.zeros(1), reward=-1.0)
     note()
     sense(trial, 0, None, 4.0)
@@ -284,6 +287,7 @@ def test_an_alarm_is_that_of_the_last_input(kind: str) -> None:
     else:
         sense(trial, 0, far, 0.0)
     assert alarm_of(trial) == "lost"
+    assert trial.is_lost
     if kind == "observed":
         acted(trial)
         observed(trial, None)

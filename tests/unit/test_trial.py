@@ -61,19 +61,19 @@ def failing_configuration(tmp_path: Path, error: str) -> Configuration:
     return load(path)
 
 
-def one(configuration: Configuration, trial: int = 0) -> TrialResult:
+def one(configuration: Configuration, trial: int = 0, **watched: Any) -> TrialResult:
     return run_trial(
         Planner(configuration.problem, configuration.planning),
         configuration.simulator.seed,
         trial,
         max_steps=configuration.simulator.max_steps,
+        **watched,
     )
 
 
 class TestOneTrial:
     def test_an_environment_may_say_that_the_task_failed(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)
-        problem, simulator = configuration.problem, configuration.simulator
 
         class Failing(SimulatedEnvironment):
             says: Any = "failed"
@@ -81,28 +81,15 @@ class TestOneTrial:
             def is_done(self) -> Any:
                 return self.says if self.step == 7 else super().is_done()
 
-        world = Failing(problem, simulator.seed, 0)
-        result = run_trial(
-            Planner(problem, configuration.planning),
-            simulator.seed,
-            0,
-            max_steps=simulator.max_steps,
-            environment=world,
-        )
+        result = one(configuration, environment=Failing(configuration.problem, 3, 0))
         assert (result.outcome, result.success, result.failed) == ("failed", False, True)
         assert result.steps == 7
         for wrong, says in (("crashed", "'crashed'"), (1, "1")):
-            world = Failing(problem, simulator.seed, 0)
+            world = Failing(configuration.problem, 3, 0)
             world.says = wrong
             message = f"Failing: is_done returned {says}; it must return {DONE_VALUES}"
             with pytest.raises(EnvironmentFailedError, match=f"^{message}$"):
-                run_trial(
-                    Planner(problem, configuration.planning),
-                    simulator.seed,
-                    0,
-                    max_steps=simulator.max_steps,
-                    environment=world,
-                )
+                one(configuration, environment=world)
 
     def test_a_simulated_world_may_fail(self) -> None:
         class Cliff(Line):
@@ -150,28 +137,19 @@ class TestOneTrial:
             def perform_sensing(self, sensing_action: int) -> Any:
                 return None
 
-        planner = Planner(configuration.problem, configuration.planning)
+        world = Blind(configuration.problem, 3, 0)
         with pytest.raises(
             EnvironmentFailedError,
             match=r"Blind: perform_sensing gave no reading 3 times in a row; "
             r"environment\.max_missing_in_a_row allows 2",
         ):
-            run_trial(
-                planner,
-                3,
-                environment=Blind(configuration.problem, 3, 0),
-                max_missing_in_a_row=2,
-            )
-
-    def test_digest_is_the_hash_of_the_decisions(self, tmp_path: Path) -> None:
-        result = one(configuration_of(tmp_path))
-        assert result.decisions is not None
-        expected = hashlib.blake2b(result.decisions.log, digest_size=32).hexdigest()
-        assert result.digest == expected
+            one(configuration, environment=world, max_missing_in_a_row=2)
 
     def test_decisions_come_in_the_order_of_the_loop(self, tmp_path: Path) -> None:
         result = one(configuration_of(tmp_path))
         assert result.decisions is not None
+        log = result.decisions.log
+        assert result.digest == hashlib.blake2b(log, digest_size=32).hexdigest()
         decisions = list(result.decisions)
         task = [item for item in decisions if isinstance(item, ActingRecord)]
         sensing = [item for item in decisions if isinstance(item, Sensed)]
@@ -197,15 +175,9 @@ class TestOneTrial:
                 self.performed.append(encode_floats(task_action))
                 return super().perform(task_action)
 
-        environment = Noting(configuration.problem, configuration.simulator.seed, 0)
+        environment = Noting(configuration.problem, 3, 0)
         environment.sensed, environment.performed = [], []
-        result = run_trial(
-            Planner(configuration.problem, configuration.planning),
-            configuration.simulator.seed,
-            0,
-            max_steps=configuration.simulator.max_steps,
-            environment=environment,
-        )
+        result = one(configuration, environment=environment)
         assert result.decisions is not None
         decisions = list(result.decisions)
         assert environment.sensed == [
@@ -219,13 +191,7 @@ class TestOneTrial:
     def test_an_observer_changes_nothing(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)
         recorder = Recorder(trial=0)
-        watched = run_trial(
-            Planner(configuration.problem, configuration.planning),
-            configuration.simulator.seed,
-            0,
-            max_steps=configuration.simulator.max_steps,
-            observer=recorder,
-        )
+        watched = one(configuration, observer=recorder)
         assert watched.digest == one(configuration).digest
         assert recorder.record.result is watched
 

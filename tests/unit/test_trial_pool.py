@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from tests.unit.test_trial import configuration_of, failing_configuration, one
 
@@ -47,9 +48,43 @@ def test_trials_of_several_arms(tmp_path: Path, jobs: int) -> None:
             pool.submit(arms[0], trial)
         pool.drop(arms[0])
         assert list(pool.run()) == []
+        pool.submit(arms[0], 0)
+    assert pool.waiting == 0
     assert sorted(found) == [(arm.label, trial) for arm in arms for trial in (0, 2)]
     assert found["as it is", 2].digest == one(configuration_of(tmp_path), 2).digest
     assert found["random", 2].digest != found["as it is", 2].digest
+
+
+def test_a_worker_builds_a_problem_once_and_tells_how_each_trial_went(tmp_path: Path) -> None:
+    """What runs in a worker process, here without one."""
+    runner, arms = trial_pool._Runner(2), arms_of(tmp_path)
+
+    def answers(number: int, trial: int, arm: Arm | None = None) -> list[Any]:
+        new = b"" if arm is None else trial_pool._pickled(arm)
+        message = msgspec.msgpack.encode(trial_pool._Trial(number, trial, new))
+        return [trial_pool._ANSWERS.decode(each) for each in runner.all_answers(message)]
+
+    built, finished = answers(0, 2, arms[0])
+    assert isinstance(built, trial_pool._Built)
+    assert finished.result.digest == one(configuration_of(tmp_path), 2).digest
+    assert finished.elapsed_s > 0.0
+    assert [type(each).__name__ for each in answers(1, 2, arms[1])] == ["_Built", "_Finished"]
+    known: dict[int, Any] = runner._arms
+    assert known[0].problem is known[1].problem
+    assert [type(each).__name__ for each in answers(0, 3)] == ["_Finished"]
+    assert not answers(2, 0)[0].expected  # an arm that it was never sent
+    for own, cores in ((None, 2), (1, 1), (8, 2)):
+        sensing = msgspec.structs.replace(arms[0].planning.active_sensing, num_cores=own)
+        planning = msgspec.structs.replace(arms[0].planning, active_sensing=sensing)
+        answers(3, 0, dataclasses.replace(arms[0], planning=planning))
+        assert known[3].planning.active_sensing.num_cores == cores
+
+
+def test_the_time_of_a_trial_is_a_mean() -> None:
+    times = trial_pool._Times()
+    for elapsed_s in (1.0, 3.0, 8.0):
+        times.add(elapsed_s)
+    assert (times.count, times.mean_s) == (3, 4.0)
 
 
 def test_a_choice_by_results_waits_for_few(tmp_path: Path) -> None:
@@ -162,6 +197,7 @@ def test_a_dead_worker_is_named_and_costs_no_other_trial(tmp_path: Path) -> None
                     assert pid is not None
                     os.kill(pid, signal.SIGKILL)
         finished += [done.trial for done in pool.run(more)]
+    assert (died.value.overdue, died.value.killed) == (False, True)
     assert sorted([*finished, died.value.trial]) == list(range(60))
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from holdfast import numerics
-from holdfast.numerics import randomness
+from holdfast.numerics.randomness import Purpose, Stream, stream
 from holdfast.planning import validation_gate
 from holdfast.planning.belief import Belief, uniform_weights, update
 from holdfast.planning.planner import Planner
@@ -138,12 +138,10 @@ class Heavy(ProblemBase):
     sensing_actions = ("look",)
     asked = 0
 
-    def initial_states(self, stream: randomness.Stream, count: int) -> np.ndarray:
+    def initial_states(self, stream: Stream, count: int) -> np.ndarray:
         return stream.normal((count, 1))
 
-    def move(
-        self, states: np.ndarray, actions: np.ndarray, stream: randomness.Stream
-    ) -> np.ndarray:
+    def move(self, states: np.ndarray, actions: np.ndarray, stream: Stream) -> np.ndarray:
         return states
 
     def policy(self, states: np.ndarray, stage: int) -> np.ndarray:
@@ -160,7 +158,7 @@ class Heavy(ProblemBase):
         return -numerics.log(1.0 + away * away)
 
     def sample_observation(
-        self, state: np.ndarray, sensing_action: int, stream: randomness.Stream
+        self, state: np.ndarray, sensing_action: int, stream: Stream
     ) -> np.ndarray:
         above, below = stream.normal(2)
         shown: np.ndarray = state + 0.1 * above / below
@@ -168,7 +166,7 @@ class Heavy(ProblemBase):
 
 
 def ranked(problem: Heavy, belief: Belief, observed: np.ndarray, trial: int) -> bool:
-    random = randomness.stream(7, trial, 0, randomness.Purpose.RANK_TEST)
+    random = stream(7, trial, 0, Purpose.RANK_TEST)
     return update(problem, belief, 0, observed, random)[1].within_gate
 
 
@@ -180,7 +178,7 @@ def test_the_rank_test_is_exact() -> None:
     outside = 0
     problem = Heavy()
     for trial in range(2000):
-        random = randomness.stream(5, trial, 0, randomness.Purpose.INITIAL_BELIEF)
+        random = stream(5, trial, 0, Purpose.INITIAL_BELIEF)
         states = np.concatenate([random.normal((20, 1)), 5.0 + random.substream(0).normal((20, 1))])
         truth = states[int(40 * random.substream(1).uniform())]
         observed = problem.sample_observation(truth, 0, random.substream(2))
@@ -191,9 +189,7 @@ def test_the_rank_test_is_exact() -> None:
 
 
 def test_the_rank_test_finds_what_is_far_and_repeats_itself() -> None:
-    belief = Belief.uniform(
-        randomness.stream(3, 0, 0, randomness.Purpose.PREDICTION).normal((50, 1))
-    )
+    belief = Belief.uniform(stream(3, 0, 0, Purpose.PREDICTION).normal((50, 1)))
     far = [ranked(Heavy(), belief, np.array([80.0]), trial) for trial in range(20)]
     near = [ranked(Heavy(), belief, np.array([0.5]), trial) for trial in range(20)]
     assert sum(far) <= 4
@@ -201,6 +197,34 @@ def test_the_rank_test_finds_what_is_far_and_repeats_itself() -> None:
     assert far == [ranked(Heavy(), belief, np.array([80.0]), trial) for trial in range(20)]
     # Who does not ask for it gets none: every observation is possible.
     assert update(Heavy(), belief, 0, [80.0])[1].within_gate
+
+
+def test_the_rank_test_draws_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Any other numbers would be as good for a filter, but decide otherwise."""
+    drawn: list[tuple[float, Stream]] = []
+    densities: list[float] = []
+
+    class Noting(Heavy):
+        def sample_observation(self, state: np.ndarray, action: int, stream: Stream) -> np.ndarray:
+            drawn.append((float(state[0]), stream))
+            return state
+
+    random = stream(7, 0, 0, Purpose.RANK_TEST)
+    belief = Belief.weighted(random.normal((40, 1)), random.uniform(40))
+    monkeypatch.setattr(
+        "holdfast.planning.belief.is_typical",
+        lambda density, draw: densities.extend((density, *map(draw, range(NUM_RANKED)))),
+    )
+    update(Noting(), belief, 0, [80.0], random)
+    likelihoods = np.exp(Heavy().log_likelihood(belief.states, 0, np.array([80.0])))
+    assert densities[0] == pytest.approx(np.log(belief.weights @ likelihoods))
+    expected = []
+    for own in map(random.substream, range(NUM_RANKED)):
+        teeth = (np.arange(40) + own.substream(0).uniform()) / 40
+        comb = np.searchsorted(np.cumsum(belief.weights), teeth, side="right")
+        chosen = belief.states[comb[int(40 * own.substream(1).uniform())], 0]
+        expected.append((float(chosen), own.substream(2)))
+    assert drawn == expected
 
 
 def test_a_problem_asks_for_the_rank_test() -> None:

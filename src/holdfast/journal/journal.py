@@ -114,7 +114,8 @@ class Journal(JournalReader):
             cls.create_from(path, old_entries(old)).close()
         try:
             for file in reversed(files_of(old)):
-                file.rename(file.with_name(file.name.replace(old.name, f"{old.name}.old", 1)))
+                suffix = file.name.removeprefix(old.name)
+                file.rename(file.with_name(f"{old.name}.old{suffix}"))
         except OSError as error:
             raise OutputError(f"{old}: cannot be renamed: {error.strerror}") from error
 

@@ -212,11 +212,9 @@ def choose_sensing_action(
             f"the entropy after sensing action {index} of {problem.name} is not a number: a "
             "hypothetical observation had no likelihood under any particle"
         )
-    if estimator.log_volume != 0.0:
-        # After the choice: what is the same for all must not decide it by its rounding.
-        volume = estimator.log_volume * sum(factors) * _total_factor(settings)
-        entropies, samples = entropies + volume, samples + volume
-    return index, SensingInfo(entropies, samples, likelihoods, visits, prices)
+    # After the choice: what is the same for all must not decide it by its rounding.
+    volume = estimator.log_volume * sum(factors) * _total_factor(settings)
+    return index, SensingInfo(entropies + volume, samples + volume, likelihoods, visits, prices)
 
 
 def _least(scores: FloatArray, *, optional: bool) -> int:

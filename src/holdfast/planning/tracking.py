@@ -94,7 +94,7 @@ class Trial:
     @property
     def begun(self) -> bool:
         """Whether anything has happened."""
-        return self.num_inputs > 0 or self.state.step > 0 or self.pending is not None
+        return self.num_inputs > 0  # a trial begins with the choice of what to sense
 
     @property
     def actions(self) -> list[FloatArray]:

@@ -136,7 +136,7 @@ class Question:
     @property
     def is_first(self) -> bool:
         """Whether its trial has only begun, so that a service needs nothing to reach its state."""
-        return self.state.step == 0 and self.num_inputs == 0
+        return self.num_inputs == 0
 
     def followed(self) -> list[tuple[str, str]]:
         """Return the kind and the service of each part of the answer that the robot follows."""
