@@ -11,7 +11,7 @@ sample of all problems (a random effect).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -311,12 +311,13 @@ def _default_candidates(chosen_by: _Places, cells: _Cells) -> pd.DataFrame:
     everywhere = next(iter(GROUPS))
     chosen = min(_CANDIDATES, key=lambda way: float(chosen_by[everywhere, way][0].mean()))
     return pd.concat(
-        [_candidate(way, cells).assign(chosen=way == chosen) for way in _CANDIDATES],
+        [verdict_on(way, cells).assign(chosen=way == chosen) for way in _CANDIDATES],
         ignore_index=True,
     )
 
 
-def _candidate(candidate: str, cells: _Cells) -> pd.DataFrame:
+def verdict_on(candidate: str, cells: _Cells, rivals: Sequence[str] = RIVALS) -> pd.DataFrame:
+    """Return a candidate's comparisons with its rivals by the study's rule."""
     table = pd.DataFrame(
         {
             "candidate": candidate,
@@ -333,7 +334,7 @@ def _candidate(candidate: str, cells: _Cells) -> pd.DataFrame:
         }
         for case in _CASES
         for name, intervals in _EACH_AND_ALL
-        for rival in RIVALS
+        for rival in rivals
     )
     levels = statistics.holm(np.concatenate([table["steps_p_value"], table["success_p_value"]]))
     table["steps_adjusted_p_value"], table["success_adjusted_p_value"] = np.split(levels, 2)

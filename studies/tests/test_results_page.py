@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 import pandas as pd
 import pytest
+from benchmarks import expected_return
 from matplotlib.text import Text
 
 from studies import offload_break_even, plots, published_2017
@@ -203,6 +204,15 @@ def test_tables_follow_from_the_committed_trials(path: Path) -> None:
     for name, table in report.tables.items():
         compare(kept.study, name, table)
     assert path.stat().st_size < 2_000_000
+
+
+def test_the_verdict_on_expected_return_follows_from_its_trials() -> None:
+    tables = expected_return.verdict(DOCS / "results" / "expected_return" / "trials.csv")
+    for name, table in zip(("verdict", "together"), tables, strict=True):
+        compare("expected_return", name, table)
+    rows = tables[0][tables[0]["candidate"] == expected_return.CANDIDATE]
+    beaten = sum(rows["beaten_in"] != "")
+    assert f"is beaten in {beaten} of {len(rows)} comparisons" in " ".join(PAGE.split())
 
 
 def is_the_same(cell: str, other: str) -> bool:
