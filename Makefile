@@ -42,8 +42,11 @@ demo: $(INSTALLED_FIGURES) ## a cloud and a robot are killed, and no decision ch
 
 install: $(INSTALLED_DEV) $(INSTALLED_COMPILED) ## the environments, which the others make when they need them
 
-# Each of the two processes imports what it finds, which takes as long as many of the tests.
-PYTEST := $(BIN)/pytest -q -n 2 --dist worksteal --ignore=tests/deploy --ignore=tests/ros
+# Each of the processes imports what it finds, which takes as long as many of the tests.
+WORKERS := 2
+# Real processes wait for each other most of the time.
+test test-real: WORKERS := 4
+PYTEST = $(BIN)/pytest -q -n $(WORKERS) --dist worksteal --ignore=tests/deploy --ignore=tests/ros
 # For one test that takes minutes: what takes longer hangs.
 LONG := -o faulthandler_timeout=2400
 
@@ -82,7 +85,7 @@ test-ros: $(INSTALLED_DEV) ## a real ROS 1, and ROS 2 Kilted and Jazzy, which te
 
 test-ros1: $(INSTALLED_DEV) ## those of them that need Debian's ROS 1 alone, but for the slow ones
 	tests/ros/set_up_ros1 $(ROS1)
-	ROS1=$(ROS1) $(BIN)/pytest -q $(LONG) -m "ros and not slow" -n 2 --dist worksteal \
+	ROS1=$(ROS1) $(BIN)/pytest -q $(LONG) -m "ros and not slow" -n 3 --dist worksteal \
 	    tests/ros/test_ros1_*.py tests/ros/test_master_guard.py
 
 fuzz: $(INSTALLED_DEV) ## a live service is attacked in all ways, 5 minutes over each wire
