@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -35,31 +35,36 @@ def socket_directory() -> Iterator[Path]:
         yield Path(directory)
 
 
-@pytest.fixture(params=wires.WIRES)
-def wire(
-    request: pytest.FixtureRequest,
-    socket_directory: Path,
-    robot_tls: TlsFiles,
-    service_tls: TlsFiles,
-) -> wires.Wire:
-    match request.param:
-        case "in_process":
-            return wires.InProcessWire()
-        case "launched":
+@pytest.fixture
+def wire_of(
+    socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles
+) -> Callable[[str], wires.StreamWire]:
+    """Return what makes a wire of a kind, with the credentials that it takes."""
+
+    def make(kind: str) -> wires.StreamWire:
+        if kind == "launched":
             return wires.StreamWire("unix", socket_directory, launched=True)
-        case "tls" | "udp":
-            return wires.StreamWire(
-                request.param, socket_directory, robot_tls=robot_tls, service_tls=service_tls
-            )
-        case protocol:
-            return wires.StreamWire(protocol, socket_directory)
+        keys = (robot_tls, service_tls) if kind in ("tls", "udp") else (None, None)
+        return wires.StreamWire(kind, socket_directory, robot_tls=keys[0], service_tls=keys[1])
+
+    return make
+
+
+@pytest.fixture(params=wires.WIRES)
+def wire(request: pytest.FixtureRequest, wire_of: Callable[[str], wires.StreamWire]) -> wires.Wire:
+    return wires.InProcessWire() if request.param == "in_process" else wire_of(request.param)
 
 
 @pytest.fixture
-def tcp(socket_directory: Path) -> wires.StreamWire:
-    return wires.StreamWire("tcp", socket_directory)
+def tcp(wire_of: Callable[[str], wires.StreamWire]) -> wires.StreamWire:
+    return wire_of("tcp")
 
 
 @pytest.fixture
-def tls(socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles) -> wires.StreamWire:
-    return wires.StreamWire("tls", socket_directory, robot_tls=robot_tls, service_tls=service_tls)
+def tls(wire_of: Callable[[str], wires.StreamWire]) -> wires.StreamWire:
+    return wire_of("tls")
+
+
+@pytest.fixture
+def udp(wire_of: Callable[[str], wires.StreamWire]) -> wires.StreamWire:
+    return wire_of("udp")

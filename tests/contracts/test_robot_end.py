@@ -21,8 +21,10 @@ from tests.contracts.wires import (
     Inbox,
     StreamWire,
     Visitor,
+    answers,
     connected,
     echo,
+    joined,
     service_process,
     until,
 )
@@ -30,7 +32,6 @@ from tests.process_states import stop
 
 from holdfast.protocol.robot_events import (
     CallEnded,
-    ReplyReceived,
     ServiceAppeared,
     ServiceVanished,
 )
@@ -79,15 +80,9 @@ class TestUnreachable:
         ],
     )
     async def test_nobody_listens_which_is_told_once_in_each_absence(
-        self,
-        socket_directory: Path,
-        robot_tls: TlsFiles,
-        service_tls: TlsFiles,
-        protocol: str,
-        reason: str,
+        self, wire_of: Callable[[str], StreamWire], protocol: str, reason: str
     ) -> None:
-        keys = (robot_tls, service_tls) if protocol in ("tls", "udp") else (None, None)
-        wire = StreamWire(protocol, socket_directory, robot_tls=keys[0], service_tls=keys[1])
+        wire = wire_of(protocol)
         robot, inbox = wire.robot("cloud"), Inbox()
         async with contextlib.AsyncExitStack() as stack:
             stack.push_async_callback(wire.close_on_loop)
@@ -230,8 +225,7 @@ class TestHandshakeIsEnough:
         assert isinstance(second, StreamServiceTransport)
         await second.start(echo)
         incarnation = await inbox.appeared(times=2)
-        robot.call("cloud", 1, b"question")
-        assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
+        await answers(robot, inbox, 1)
         assert second.end_links(lambda _: "is sent away") == 1
         assert await inbox.appeared(times=3) == incarnation
         assert incarnation != "b1"
@@ -269,18 +263,12 @@ async def test_what_came_while_a_robot_stood_still_is_read_before_anybody_is_giv
         return found
 
     async with service_process(tcp.endpoint("cloud"), "b1", lease_ms=300.0):
-        robot, inbox = tcp.robot("cloud"), Inbox()
-        robot.start(inbox)
-        await inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        robot, inbox = await joined(tcp)
         monkeypatch.setattr(selector, "select", select)
         for number in range(2):
             still_s[0] = 0.6
             await until(lambda: still_s[0] == 0.0)
-            robot.call("cloud", number, b"echo")
-            assert await inbox.of_call(number) == [
-                ReplyReceived(number, b"echo"),
-                CallEnded(number),
-            ]
+            await answers(robot, inbox, number, b"echo")
         assert not any(isinstance(each, ServiceVanished) for each in inbox.events)
 
 

@@ -13,7 +13,6 @@ from tests.contracts import wires
 
 from holdfast.protocol.robot_events import (
     CallEnded,
-    ReplyReceived,
     ServiceAppeared,
     ServiceVanished,
 )
@@ -34,9 +33,7 @@ class TestEndedLinks:
                 call.end()
 
         await tcp.service("cloud", "b1").start(serve)
-        robot, inbox = tcp.robot("cloud"), wires.Inbox()
-        robot.start(inbox)
-        await inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        robot, inbox = await wires.joined(tcp)
         robot.call("cloud", 1, b"answered")
         assert await inbox.of_call(1) == [CallEnded(1)]
         robot.call("cloud", 2, b"open")
@@ -90,11 +87,8 @@ class TestCertificates:
         writer.close()
         with contextlib.suppress(ssl.SSLError):
             await writer.wait_closed()
-        robot, inbox = tls.robot("cloud"), wires.Inbox()
-        robot.start(inbox)
-        await inbox.wait_for(ServiceAppeared("cloud", "b1"))
-        robot.call("cloud", 1, b"friend")
-        assert await inbox.of_call(1) == [ReplyReceived(1, b"friend"), CallEnded(1)]
+        robot, inbox = await wires.joined(tls)
+        await wires.answers(robot, inbox, 1, b"friend")
         assert received == [b"friend"]
         assert {"shows no certificate"} < set(tls.reasons())
 
@@ -153,17 +147,14 @@ class TestCertificates:
             robot.start(inbox)
             await inbox.wait_for(ServiceAppeared("cloud", "b1"))
         tls.robot_tls = authority.issue("one of many", oid.ExtendedKeyUsageOID.CLIENT_AUTH)
-        other, other_inbox = tls.robot("cloud"), wires.Inbox()
-        other.start(other_inbox)
-        await other_inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        other, other_inbox = await wires.joined(tls)
         reason = "has 3 links, and another robot needs one of 3"
         await wires.until(
             lambda: tls.refusals[:1] == [("cloud", f"refuses this end, which {reason}")]
         )
         full = "refuses this end, which is one too many: 3 robots are connected"
         await wires.until(lambda: ("cloud", full) in tls.refusals)  # as it is back
-        other.call("cloud", 1, b"question")
-        assert await other_inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
+        await wires.answers(other, other_inbox, 1)
         assert ServiceVanished("cloud", "b1") not in other_inbox
 
     async def test_a_robot_can_be_closed_amid_a_handshake(self, tls: wires.StreamWire) -> None:

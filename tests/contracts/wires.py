@@ -356,6 +356,22 @@ async def connected(
     return robot, inbox, serving
 
 
+async def joined(wire: Wire) -> tuple[RobotTransport, Inbox]:
+    """Return a robot's end, once it sees the service."""
+    robot, inbox = wire.robot("cloud"), Inbox()
+    robot.start(inbox)
+    await inbox.wait_for(ServiceAppeared("cloud", "b1"))
+    return robot, inbox
+
+
+async def answers(
+    robot: RobotTransport, inbox: Inbox, call: int, question: bytes = b"question"
+) -> None:
+    """Ask a service that echoes; nothing else must come of it."""
+    robot.call("cloud", call, question)
+    assert await inbox.of_call(call) == [ReplyReceived(call, question), CallEnded(call)]
+
+
 def refusal_of(events: list[TransportEvent]) -> Refused:
     """Return what a call was refused with, which then ended."""
     replied, _ = events

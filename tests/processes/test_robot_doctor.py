@@ -147,7 +147,9 @@ def services(home: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[C
 
         @functools.cache
         def endpoint_of(protocol: str, keys: str | None, host: str = "127.0.0.1") -> str:
-            return service_of(site, protocol, keys and home.parent / keys, host).endpoint
+            return service_of(
+                site, protocol, None if keys is None else home.parent / keys, host
+            ).endpoint
 
         yield endpoint_of
 
