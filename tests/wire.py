@@ -104,16 +104,6 @@ class RawLink:
                 self.socket.close()
                 raise
 
-    @classmethod
-    def over(cls, connected: socket.socket) -> Self:
-        """Return a link over a socket that is connected already."""
-        link = cls.__new__(cls)
-        link._buffer = bytearray()
-        link._has_magic = False
-        connected.settimeout(PATIENCE_S)
-        link.socket = connected
-        return link
-
     def __enter__(self) -> Self:
         return self
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ssl
-from pathlib import Path
 
 import pytest
 from cryptography.x509 import oid
@@ -19,7 +18,6 @@ from holdfast.protocol.robot_events import (
 from holdfast.transport import service_end
 from holdfast.transport.contract import IncomingCall
 from holdfast.transport.endpoints import TlsFiles
-from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.tls import client_context
 
 
@@ -43,43 +41,15 @@ class TestEndedLinks:
 
 
 class TestCertificates:
-    async def test_strangers_see_nothing(
-        self, tls: wires.StreamWire, robot_tls: TlsFiles, tmp_path: Path
+    async def test_who_shows_no_certificate_sees_nothing(
+        self, tls: wires.StreamWire, robot_tls: TlsFiles
     ) -> None:
-        usage = oid.ExtendedKeyUsageOID.CLIENT_AUTH
-        foreign = wires.Authority(tmp_path / "foreign").issue("robot", usage)
-        # A stranger's certificate, but the right authority: it believes the service.
-        stranger = TlsFiles(robot_tls.authority, foreign.certificate, foreign.key)
-        received: list[bytes] = []
-
-        def serve(call: IncomingCall) -> None:
-            received.append(call.payload)
-            wires.echo(call)
-
-        await tls.service("cloud", "b1").start(serve)
-        address = tls.endpoint("cloud")
-        refusals: list[tuple[str, str]] = []
-        for files in (foreign, stranger):
-            outsider = StreamRobotTransport(
-                {"cloud": address},
-                tls=files,
-                on_event=wires.unreachable_into(refusals),
-            )
-            tls.ends.append(outsider)
-            inbox = wires.Inbox()
-            refusals.clear()
-            outsider.start(inbox)
-            await wires.until(lambda: bool(refusals))
-            outsider.call("cloud", 1, b"stranger")
-            assert await inbox.of_call(1) == [CallEnded(1)]
-            assert inbox.events == [CallEnded(1)]
-            expected = (
-                "has a certificate that was" if files is foreign else "refuses this end's cert"
-            )
-            assert expected in refusals[0][1]
+        """What else is not believed: unit/test_transport_credentials.py."""
+        received = wires.Received()
+        await tls.service("cloud", "b1").start(received)
         bare = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         bare.load_verify_locations(robot_tls.authority)
-        host, _, port = address.removeprefix("tls/").rpartition(":")
+        host, _, port = tls.endpoint("cloud").removeprefix("tls/").rpartition(":")
         with pytest.raises(ssl.SSLError, match="CERTIFICATE_REQUIRED"):
             reader, writer = await asyncio.open_connection(host, int(port), ssl=bare)
             writer.write(wires.HELLO)
@@ -87,10 +57,10 @@ class TestCertificates:
         writer.close()
         with contextlib.suppress(ssl.SSLError):
             await writer.wait_closed()
-        robot, inbox = await wires.joined(tls)
-        await wires.answers(robot, inbox, 1, b"friend")
-        assert received == [b"friend"]
-        assert {"shows no certificate"} < set(tls.reasons())
+        robot, _ = await wires.joined(tls)
+        robot.call("cloud", 1, b"friend")
+        assert (await received.next()).payload == b"friend"
+        assert set(tls.reasons()) == {"shows no certificate"}
 
     async def test_a_robot_has_the_name_of_its_certificate_or_tells_none(
         self, tls: wires.StreamWire
