@@ -164,12 +164,10 @@ def test_where_keys_are_mounted_a_rotation_and_then_a_revocation_take_effect(
     assert robot.statuses() == [LOST]
     revoked = "has a certificate that has been revoked"
     assert revoked in " ".join(str(each.get("reason")) for each in events_of(robot.out))
-    told = cloud.process.matching("credentials_reloaded", num_revoked=1)
-    assert sum(each["links_ended"] for each in told) == 1
-    ended = cloud.process.matching("robot_disconnected", robot="anna")
-    assert [each["reason"] for each in ended] == ["replaced its credentials", revoked][
-        -len(ended) :
-    ]
+    reloads = cloud.process.matching("credentials_reloaded", num_revoked=1)
+    assert sum(each["links_ended"] for each in reloads) == 1
+    (ended,) = cloud.process.matching("robot_disconnected", robot="anna")
+    assert ended["reason"] == revoked
     assert page(address, "/readyz") == (200, "ok\n")
     assert "\nholdfast_credentials_stale 0.0\n" in page(address, "/metrics")[1]
 
