@@ -7,25 +7,28 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from cryptography.x509 import oid
 from tests.contracts import wires
 
 from holdfast.transport.endpoints import TlsFiles
+from holdfast.transport.key_ring import make_credentials
 
 
 @pytest.fixture(scope="session")
-def authority(tmp_path_factory: pytest.TempPathFactory) -> wires.Authority:
-    return wires.Authority(tmp_path_factory.mktemp("tls") / "authority")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a directory with the keys of two robots and a service of one authority."""
+    keys = tmp_path_factory.mktemp("tls") / "keys"
+    make_credentials(keys, robots=["robot", "another"], services=["service"])
+    return keys
 
 
 @pytest.fixture(scope="session")
-def robot_tls(authority: wires.Authority) -> TlsFiles:
-    return authority.issue("robot", oid.ExtendedKeyUsageOID.CLIENT_AUTH)
+def robot_tls(keys: Path) -> TlsFiles:
+    return TlsFiles.of(keys / "robot")
 
 
 @pytest.fixture(scope="session")
-def service_tls(authority: wires.Authority) -> TlsFiles:
-    return authority.issue("service", oid.ExtendedKeyUsageOID.SERVER_AUTH)
+def service_tls(keys: Path) -> TlsFiles:
+    return TlsFiles.of(keys / "service")
 
 
 @pytest.fixture

@@ -14,10 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cryptography.x509 import oid
 from tests.contracts.wires import (
     PATIENCE_S,
-    Authority,
     Inbox,
     StreamWire,
     Visitor,
@@ -39,6 +37,7 @@ from holdfast.transport import dialer as dialer_module
 from holdfast.transport import links
 from holdfast.transport.dialer import Dialer
 from holdfast.transport.endpoints import TlsFiles
+from holdfast.transport.key_ring import make_credentials
 from holdfast.transport.service_end import StreamServiceTransport
 from holdfast.transport.tls import server_context
 
@@ -235,12 +234,13 @@ class TestHandshakeIsEnough:
     ) -> None:
         _, inbox, service = await connected(tls)
         await service.close()
-        usage = oid.ExtendedKeyUsageOID.SERVER_AUTH
         # It has our certificate, but believes another authority: it refuses the robot's.
         assert tls.service_tls is not None
-        foreign = Authority(tmp_path / "foreign").issue("service", usage)
+        make_credentials(tmp_path / "foreign")
         ours = tls.service_tls
-        tls.service_tls = TlsFiles(foreign.authority, ours.certificate, ours.key)
+        tls.service_tls = TlsFiles(
+            tmp_path / "foreign" / "service" / "authority.pem", ours.certificate, ours.key
+        )
         await tls.service("cloud", "b2").start(echo)
         await until(lambda: len(tls.reasons()) >= 3)
         assert len(inbox.incarnations()) <= 2

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ssl
+from pathlib import Path
 
 import pytest
-from cryptography.x509 import oid
 from tests.contracts import wires
 
 from holdfast.protocol.robot_events import (
@@ -108,7 +108,7 @@ class TestCertificates:
             assert (await calls.next()).robot == name
 
     async def test_links_of_one_certificate_keep_no_other_out(
-        self, tls: wires.StreamWire, authority: wires.Authority, monkeypatch: pytest.MonkeyPatch
+        self, tls: wires.StreamWire, keys: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(service_end, "MAX_LINKS", 3)
         await tls.service("cloud", "b1").start(wires.echo)
@@ -116,7 +116,7 @@ class TestCertificates:
         for robot, inbox in greedy:
             robot.start(inbox)
             await inbox.wait_for(ServiceAppeared("cloud", "b1"))
-        tls.robot_tls = authority.issue("one of many", oid.ExtendedKeyUsageOID.CLIENT_AUTH)
+        tls.robot_tls = TlsFiles.of(keys / "another")
         other, other_inbox = await wires.joined(tls)
         reason = "has 3 links, and another robot needs one of 3"
         await wires.until(
