@@ -85,7 +85,7 @@ test-ros: $(INSTALLED_DEV) ## a real ROS 1, and ROS 2 Kilted and Jazzy, which te
 
 test-ros1: $(INSTALLED_DEV) ## those of them that need Debian's ROS 1 alone, but for the slow ones
 	tests/ros/set_up_ros1 $(ROS1)
-	ROS1=$(ROS1) $(BIN)/pytest -q $(LONG) -m "ros and not slow" -n 3 --dist worksteal \
+	ROS1=$(ROS1) $(BIN)/pytest -q $(LONG) -m "ros and not slow" -n 2 --dist worksteal \
 	    tests/ros/test_ros1_*.py tests/ros/test_master_guard.py
 
 fuzz: $(INSTALLED_DEV) ## a live service is attacked in all ways, 5 minutes over each wire

@@ -218,7 +218,7 @@ def test_a_run_decides_as_in_process_whatever_happens_to_the_cloud(
 ) -> None:
     cloud = around.serve(CLOUD, EXAMPLE)
     around.serve(RECOVERY, EXAMPLE)
-    robot = Robot(around, 0.5)
+    robot = Robot(around, 2.0)  # longer than a busy machine stands still
     steps = 0
     echo = None
     while isinstance(said := robot.next(), int):
