@@ -42,8 +42,11 @@ demo: $(INSTALLED_FIGURES) ## a cloud and a robot are killed, and no decision ch
 
 install: $(INSTALLED_DEV) $(INSTALLED_COMPILED) ## the environments, which the others make when they need them
 
-# Each of the two processes imports what it finds, which takes as long as many of the tests.
-PYTEST := $(BIN)/pytest -q -n 2 --dist worksteal --ignore=tests/deploy --ignore=tests/ros
+# Each of the processes imports what it finds, which takes as long as many of the tests.
+WORKERS := 2
+# Real processes wait for each other most of the time.
+test test-real: WORKERS := 4
+PYTEST = $(BIN)/pytest -q -n $(WORKERS) --dist worksteal --ignore=tests/deploy --ignore=tests/ros
 # For one test that takes minutes: what takes longer hangs.
 LONG := -o faulthandler_timeout=2400
 

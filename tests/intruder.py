@@ -14,7 +14,6 @@ import random
 import socket
 import ssl
 import struct
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -344,48 +343,3 @@ def _until_the_end(link: RawLink) -> Iterator[Frame]:
     """Yield frames until the other end hangs up, or says what is no frame (TLS's own alerts)."""
     with contextlib.suppress(OSError, AssertionError):
         yield from link.until_the_end()
-
-
-class Impostor:
-    """Listens as the service that it is not, with a robot's certificate."""
-
-    def __init__(
-        self, port: int, keys: Path, answer: Callable[[int], bytes] = wrong_actions
-    ) -> None:
-        self.endpoint = f"tls/127.0.0.1:{port}"
-        self.received: list[bytes] = []
-        self.knocked = 0
-        self._answer = answer
-        self._context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        self._context.load_cert_chain(keys / "certificate.pem", keys / "key.pem")
-        self._context.load_verify_locations(keys / "authority.pem")
-        self._context.set_alpn_protocols(["holdfast"])
-        self._listener = socket.create_server(("127.0.0.1", port))
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Hang up."""
-        self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while True:
-            try:
-                connection, _ = self._listener.accept()
-            except OSError:
-                return
-            self.knocked += 1
-            with contextlib.suppress(OSError, ssl.SSLError, AssertionError), connection:
-                connection.settimeout(10.0)
-                with self._context.wrap_socket(connection, server_side=True) as secured:
-                    self._serve(RawLink.over(secured))
-
-    def _serve(self, link: RawLink) -> None:
-        for frame in link.until_the_end(10.0):
-            if frame.kind == HELLO:
-                link.say(hello_of("service", "cloud", "impostor"))
-            elif frame.kind == CALL:
-                self.received.append(frame.payload)
-                link.send(LAST, frame.call, self._answer(1))

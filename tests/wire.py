@@ -82,12 +82,20 @@ class RawLink:
     """A stream to an endpoint; nothing is said on it but what is asked for."""
 
     def __init__(
-        self, endpoint: str, keys: Path | None = None, *, shakes_hands: bool = True
+        self,
+        endpoint: str | socket.socket,
+        keys: Path | None = None,
+        *,
+        shakes_hands: bool = True,
     ) -> None:
-        protocol, _, place = endpoint.partition("/")
         self._buffer = bytearray()
         self._has_magic = False
         self.socket: socket.socket
+        if isinstance(endpoint, socket.socket):  # to a process that was launched with it
+            self.socket = endpoint
+            self.socket.settimeout(PATIENCE_S)
+            return
+        protocol, _, place = endpoint.partition("/")
         if protocol == "unix":
             self.socket = socket.socket(socket.AF_UNIX)
             self.socket.settimeout(PATIENCE_S)
@@ -103,16 +111,6 @@ class RawLink:
             except BaseException:
                 self.socket.close()
                 raise
-
-    @classmethod
-    def over(cls, connected: socket.socket) -> Self:
-        """Return a link over a socket that is connected already."""
-        link = cls.__new__(cls)
-        link._buffer = bytearray()
-        link._has_magic = False
-        connected.settimeout(PATIENCE_S)
-        link.socket = connected
-        return link
 
     def __enter__(self) -> Self:
         return self
@@ -181,7 +179,11 @@ class RawClient(RawLink):
     """A robot's end that has greeted the service, and asks it one thing at a time."""
 
     def __init__(
-        self, endpoint: str, keys: Path | None = None, *, hello: bytes | None = None
+        self,
+        endpoint: str | socket.socket,
+        keys: Path | None = None,
+        *,
+        hello: bytes | None = None,
     ) -> None:
         super().__init__(endpoint, keys)
         try:

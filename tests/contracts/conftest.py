@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from cryptography.x509 import oid
 from tests.contracts import wires
 
 from holdfast.transport.endpoints import TlsFiles
+from holdfast.transport.key_ring import make_credentials
 
 
 @pytest.fixture(scope="session")
-def authority(tmp_path_factory: pytest.TempPathFactory) -> wires.Authority:
-    return wires.Authority(tmp_path_factory.mktemp("tls") / "authority")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a directory with the keys of two robots and a service of one authority."""
+    keys = tmp_path_factory.mktemp("tls") / "keys"
+    make_credentials(keys, robots=["robot", "another"], services=["service"])
+    return keys
 
 
 @pytest.fixture(scope="session")
-def robot_tls(authority: wires.Authority) -> TlsFiles:
-    return authority.issue("robot", oid.ExtendedKeyUsageOID.CLIENT_AUTH)
+def robot_tls(keys: Path) -> TlsFiles:
+    return TlsFiles.of(keys / "robot")
 
 
 @pytest.fixture(scope="session")
-def service_tls(authority: wires.Authority) -> TlsFiles:
-    return authority.issue("service", oid.ExtendedKeyUsageOID.SERVER_AUTH)
+def service_tls(keys: Path) -> TlsFiles:
+    return TlsFiles.of(keys / "service")
 
 
 @pytest.fixture
@@ -35,31 +38,36 @@ def socket_directory() -> Iterator[Path]:
         yield Path(directory)
 
 
-@pytest.fixture(params=wires.WIRES)
-def wire(
-    request: pytest.FixtureRequest,
-    socket_directory: Path,
-    robot_tls: TlsFiles,
-    service_tls: TlsFiles,
-) -> wires.Wire:
-    match request.param:
-        case "in_process":
-            return wires.InProcessWire()
-        case "launched":
+@pytest.fixture
+def wire_of(
+    socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles
+) -> Callable[[str], wires.StreamWire]:
+    """Return what makes a wire of a kind, with the credentials that it takes."""
+
+    def make(kind: str) -> wires.StreamWire:
+        if kind == "launched":
             return wires.StreamWire("unix", socket_directory, launched=True)
-        case "tls" | "udp":
-            return wires.StreamWire(
-                request.param, socket_directory, robot_tls=robot_tls, service_tls=service_tls
-            )
-        case protocol:
-            return wires.StreamWire(protocol, socket_directory)
+        keys = (robot_tls, service_tls) if kind in ("tls", "udp") else (None, None)
+        return wires.StreamWire(kind, socket_directory, robot_tls=keys[0], service_tls=keys[1])
+
+    return make
+
+
+@pytest.fixture(params=wires.WIRES)
+def wire(request: pytest.FixtureRequest, wire_of: Callable[[str], wires.StreamWire]) -> wires.Wire:
+    return wires.InProcessWire() if request.param == "in_process" else wire_of(request.param)
 
 
 @pytest.fixture
-def tcp(socket_directory: Path) -> wires.StreamWire:
-    return wires.StreamWire("tcp", socket_directory)
+def tcp(wire_of: Callable[[str], wires.StreamWire]) -> wires.StreamWire:
+    return wire_of("tcp")
 
 
 @pytest.fixture
-def tls(socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles) -> wires.StreamWire:
-    return wires.StreamWire("tls", socket_directory, robot_tls=robot_tls, service_tls=service_tls)
+def tls(wire_of: Callable[[str], wires.StreamWire]) -> wires.StreamWire:
+    return wire_of("tls")
+
+
+@pytest.fixture
+def udp(wire_of: Callable[[str], wires.StreamWire]) -> wires.StreamWire:
+    return wire_of("udp")

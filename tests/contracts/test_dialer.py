@@ -8,12 +8,20 @@ import itertools
 import random
 import socket
 from collections import Counter
-from collections.abc import AsyncIterator
-from pathlib import Path
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import pytest
-from tests.contracts.wires import PATIENCE_S, Inbox, Received, Serve, StreamWire, echo, until
+from tests.contracts.wires import (
+    PATIENCE_S,
+    Inbox,
+    Received,
+    Serve,
+    StreamWire,
+    answers,
+    echo,
+    until,
+)
 
 from holdfast.protocol.robot_events import (
     CallEnded,
@@ -23,7 +31,6 @@ from holdfast.protocol.robot_events import (
 )
 from holdfast.transport import dialer, frames
 from holdfast.transport.dialer import Dialer, RetryPauses
-from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.service_end import StreamServiceTransport
 
@@ -63,14 +70,9 @@ class Replicas:
 class TestReplicas:
     @pytest.fixture(params=["tcp", "udp"])
     def wire(
-        self,
-        request: pytest.FixtureRequest,
-        socket_directory: Path,
-        robot_tls: TlsFiles,
-        service_tls: TlsFiles,
+        self, request: pytest.FixtureRequest, wire_of: Callable[[str], StreamWire]
     ) -> StreamWire:
-        keys = (None, None) if request.param == "tcp" else (robot_tls, service_tls)
-        return StreamWire(request.param, socket_directory, robot_tls=keys[0], service_tls=keys[1])
+        return wire_of(request.param)
 
     @pytest.fixture
     def replicas(self, wire: StreamWire, monkeypatch: pytest.MonkeyPatch) -> Replicas:
@@ -143,11 +145,7 @@ class TestReplicas:
             assert dialer is not None
             await until(lambda: bool(dialer._links))
             for number in range(3):
-                robot.call("cloud", number, b"echo")
-                assert await inbox.of_call(number) == [
-                    ReplyReceived(number, b"echo"),
-                    CallEnded(number),
-                ]
+                await answers(robot, inbox, number)
             assert not gone.done()
             assert ServiceVanished("cloud", first) not in inbox
             await robot.close()

@@ -5,12 +5,20 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
-from tests.contracts.wires import HELLO, PATIENCE_S, Inbox, StreamWire, Visitor, echo, until
+from tests.contracts.wires import (
+    HELLO,
+    PATIENCE_S,
+    StreamWire,
+    Visitor,
+    answers,
+    echo,
+    joined,
+    until,
+)
 
-from holdfast.protocol.robot_events import CallEnded, ReplyReceived, ServiceAppeared
 from holdfast.transport import frames, links, listener, service_end
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.tls import TlsStream, client_context
@@ -21,14 +29,8 @@ class TestVisitors:
     """What connects to a service and is no robot of ours costs the robots nothing."""
 
     @pytest.fixture
-    def wire(
-        self, protocol: str, socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles
-    ) -> StreamWire:
-        if protocol in ("tls", "udp"):
-            return StreamWire(
-                protocol, socket_directory, robot_tls=robot_tls, service_tls=service_tls
-            )
-        return StreamWire(protocol, socket_directory)
+    def wire(self, protocol: str, wire_of: Callable[[str], StreamWire]) -> StreamWire:
+        return wire_of(protocol)
 
     @pytest.mark.parametrize(
         ("first_bytes", "plain", "over_tls"),
@@ -86,11 +88,8 @@ class TestVisitors:
                     await asyncio.sleep(0)
                     assert len(place._silent) <= listener.MAX_SILENT
                     assert len(service._without_hello) <= service_end._MAX_WITHOUT_HELLO
-            robot, inbox = wire.robot("cloud"), Inbox()
-            robot.start(inbox)
-            await inbox.wait_for(ServiceAppeared("cloud", "b1"))
-            robot.call("cloud", 1, b"question")
-            assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
+            robot, inbox = await joined(wire)
+            await answers(robot, inbox, 1)
         assert "has said no hello, and others wait" in wire.reasons()
 
     async def test_connections_that_say_nothing_are_closed_after_a_while(
@@ -116,9 +115,7 @@ class TestVisitors:
                 contextlib.suppress(BlockingIOError),  # unix: the queue is full
             ):
                 await visitor.connect()
-        robot, inbox = wire.robot("cloud"), Inbox()
-        robot.start(inbox)
-        await inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        await joined(wire)
 
 
 class TestManyFromOneAddress:

@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cryptography.x509 import oid
 from tests.contracts.wires import (
     PATIENCE_S,
-    Authority,
     Inbox,
     StreamWire,
     Visitor,
+    answers,
     connected,
     echo,
+    joined,
     service_process,
     until,
 )
@@ -30,7 +30,6 @@ from tests.process_states import stop
 
 from holdfast.protocol.robot_events import (
     CallEnded,
-    ReplyReceived,
     ServiceAppeared,
     ServiceVanished,
 )
@@ -38,6 +37,7 @@ from holdfast.transport import dialer as dialer_module
 from holdfast.transport import links
 from holdfast.transport.dialer import Dialer
 from holdfast.transport.endpoints import TlsFiles
+from holdfast.transport.key_ring import make_credentials
 from holdfast.transport.service_end import StreamServiceTransport
 from holdfast.transport.tls import server_context
 
@@ -79,15 +79,9 @@ class TestUnreachable:
         ],
     )
     async def test_nobody_listens_which_is_told_once_in_each_absence(
-        self,
-        socket_directory: Path,
-        robot_tls: TlsFiles,
-        service_tls: TlsFiles,
-        protocol: str,
-        reason: str,
+        self, wire_of: Callable[[str], StreamWire], protocol: str, reason: str
     ) -> None:
-        keys = (robot_tls, service_tls) if protocol in ("tls", "udp") else (None, None)
-        wire = StreamWire(protocol, socket_directory, robot_tls=keys[0], service_tls=keys[1])
+        wire = wire_of(protocol)
         robot, inbox = wire.robot("cloud"), Inbox()
         async with contextlib.AsyncExitStack() as stack:
             stack.push_async_callback(wire.close_on_loop)
@@ -230,8 +224,7 @@ class TestHandshakeIsEnough:
         assert isinstance(second, StreamServiceTransport)
         await second.start(echo)
         incarnation = await inbox.appeared(times=2)
-        robot.call("cloud", 1, b"question")
-        assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
+        await answers(robot, inbox, 1)
         assert second.end_links(lambda _: "is sent away") == 1
         assert await inbox.appeared(times=3) == incarnation
         assert incarnation != "b1"
@@ -241,12 +234,13 @@ class TestHandshakeIsEnough:
     ) -> None:
         _, inbox, service = await connected(tls)
         await service.close()
-        usage = oid.ExtendedKeyUsageOID.SERVER_AUTH
         # It has our certificate, but believes another authority: it refuses the robot's.
         assert tls.service_tls is not None
-        foreign = Authority(tmp_path / "foreign").issue("service", usage)
+        make_credentials(tmp_path / "foreign")
         ours = tls.service_tls
-        tls.service_tls = TlsFiles(foreign.authority, ours.certificate, ours.key)
+        tls.service_tls = TlsFiles(
+            tmp_path / "foreign" / "service" / "authority.pem", ours.certificate, ours.key
+        )
         await tls.service("cloud", "b2").start(echo)
         await until(lambda: len(tls.reasons()) >= 3)
         assert len(inbox.incarnations()) <= 2
@@ -269,18 +263,12 @@ async def test_what_came_while_a_robot_stood_still_is_read_before_anybody_is_giv
         return found
 
     async with service_process(tcp.endpoint("cloud"), "b1", lease_ms=300.0):
-        robot, inbox = tcp.robot("cloud"), Inbox()
-        robot.start(inbox)
-        await inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        robot, inbox = await joined(tcp)
         monkeypatch.setattr(selector, "select", select)
         for number in range(2):
             still_s[0] = 0.6
             await until(lambda: still_s[0] == 0.0)
-            robot.call("cloud", number, b"echo")
-            assert await inbox.of_call(number) == [
-                ReplyReceived(number, b"echo"),
-                CallEnded(number),
-            ]
+            await answers(robot, inbox, number, b"echo")
         assert not any(isinstance(each, ServiceVanished) for each in inbox.events)
 
 

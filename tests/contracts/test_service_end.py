@@ -8,19 +8,16 @@ import ssl
 from pathlib import Path
 
 import pytest
-from cryptography.x509 import oid
 from tests.contracts import wires
 
 from holdfast.protocol.robot_events import (
     CallEnded,
-    ReplyReceived,
     ServiceAppeared,
     ServiceVanished,
 )
 from holdfast.transport import service_end
 from holdfast.transport.contract import IncomingCall
 from holdfast.transport.endpoints import TlsFiles
-from holdfast.transport.robot_end import StreamRobotTransport
 from holdfast.transport.tls import client_context
 
 
@@ -34,9 +31,7 @@ class TestEndedLinks:
                 call.end()
 
         await tcp.service("cloud", "b1").start(serve)
-        robot, inbox = tcp.robot("cloud"), wires.Inbox()
-        robot.start(inbox)
-        await inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        robot, inbox = await wires.joined(tcp)
         robot.call("cloud", 1, b"answered")
         assert await inbox.of_call(1) == [CallEnded(1)]
         robot.call("cloud", 2, b"open")
@@ -46,43 +41,15 @@ class TestEndedLinks:
 
 
 class TestCertificates:
-    async def test_strangers_see_nothing(
-        self, tls: wires.StreamWire, robot_tls: TlsFiles, tmp_path: Path
+    async def test_who_shows_no_certificate_sees_nothing(
+        self, tls: wires.StreamWire, robot_tls: TlsFiles
     ) -> None:
-        usage = oid.ExtendedKeyUsageOID.CLIENT_AUTH
-        foreign = wires.Authority(tmp_path / "foreign").issue("robot", usage)
-        # A stranger's certificate, but the right authority: it believes the service.
-        stranger = TlsFiles(robot_tls.authority, foreign.certificate, foreign.key)
-        received: list[bytes] = []
-
-        def serve(call: IncomingCall) -> None:
-            received.append(call.payload)
-            wires.echo(call)
-
-        await tls.service("cloud", "b1").start(serve)
-        address = tls.endpoint("cloud")
-        refusals: list[tuple[str, str]] = []
-        for files in (foreign, stranger):
-            outsider = StreamRobotTransport(
-                {"cloud": address},
-                tls=files,
-                on_event=wires.unreachable_into(refusals),
-            )
-            tls.ends.append(outsider)
-            inbox = wires.Inbox()
-            refusals.clear()
-            outsider.start(inbox)
-            await wires.until(lambda: bool(refusals))
-            outsider.call("cloud", 1, b"stranger")
-            assert await inbox.of_call(1) == [CallEnded(1)]
-            assert inbox.events == [CallEnded(1)]
-            expected = (
-                "has a certificate that was" if files is foreign else "refuses this end's cert"
-            )
-            assert expected in refusals[0][1]
+        """What else is not believed: unit/test_transport_credentials.py."""
+        received = wires.Received()
+        await tls.service("cloud", "b1").start(received)
         bare = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         bare.load_verify_locations(robot_tls.authority)
-        host, _, port = address.removeprefix("tls/").rpartition(":")
+        host, _, port = tls.endpoint("cloud").removeprefix("tls/").rpartition(":")
         with pytest.raises(ssl.SSLError, match="CERTIFICATE_REQUIRED"):
             reader, writer = await asyncio.open_connection(host, int(port), ssl=bare)
             writer.write(wires.HELLO)
@@ -90,13 +57,10 @@ class TestCertificates:
         writer.close()
         with contextlib.suppress(ssl.SSLError):
             await writer.wait_closed()
-        robot, inbox = tls.robot("cloud"), wires.Inbox()
-        robot.start(inbox)
-        await inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        robot, _ = await wires.joined(tls)
         robot.call("cloud", 1, b"friend")
-        assert await inbox.of_call(1) == [ReplyReceived(1, b"friend"), CallEnded(1)]
-        assert received == [b"friend"]
-        assert {"shows no certificate"} < set(tls.reasons())
+        assert (await received.next()).payload == b"friend"
+        assert set(tls.reasons()) == {"shows no certificate"}
 
     async def test_a_robot_has_the_name_of_its_certificate_or_tells_none(
         self, tls: wires.StreamWire
@@ -144,7 +108,7 @@ class TestCertificates:
             assert (await calls.next()).robot == name
 
     async def test_links_of_one_certificate_keep_no_other_out(
-        self, tls: wires.StreamWire, authority: wires.Authority, monkeypatch: pytest.MonkeyPatch
+        self, tls: wires.StreamWire, keys: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(service_end, "MAX_LINKS", 3)
         await tls.service("cloud", "b1").start(wires.echo)
@@ -152,18 +116,15 @@ class TestCertificates:
         for robot, inbox in greedy:
             robot.start(inbox)
             await inbox.wait_for(ServiceAppeared("cloud", "b1"))
-        tls.robot_tls = authority.issue("one of many", oid.ExtendedKeyUsageOID.CLIENT_AUTH)
-        other, other_inbox = tls.robot("cloud"), wires.Inbox()
-        other.start(other_inbox)
-        await other_inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        tls.robot_tls = TlsFiles.of(keys / "another")
+        other, other_inbox = await wires.joined(tls)
         reason = "has 3 links, and another robot needs one of 3"
         await wires.until(
             lambda: tls.refusals[:1] == [("cloud", f"refuses this end, which {reason}")]
         )
         full = "refuses this end, which is one too many: 3 robots are connected"
         await wires.until(lambda: ("cloud", full) in tls.refusals)  # as it is back
-        other.call("cloud", 1, b"question")
-        assert await other_inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
+        await wires.answers(other, other_inbox, 1)
         assert ServiceVanished("cloud", "b1") not in other_inbox
 
     async def test_a_robot_can_be_closed_amid_a_handshake(self, tls: wires.StreamWire) -> None:

@@ -6,8 +6,8 @@ import asyncio
 import itertools
 import signal
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 from tests.contracts import wires
@@ -22,14 +22,12 @@ from holdfast.protocol.robot_events import (
     TransportEvent,
 )
 from holdfast.transport.contract import IncomingCall
-from holdfast.transport.endpoints import TlsFiles
 
 
 class TestEveryWire:
     async def test_a_call_brings_the_reply_and_one_end(self, wire: wires.Wire) -> None:
         robot, inbox, _ = await wires.connected(wire)
-        robot.call("cloud", 7, b"question")
-        assert await inbox.of_call(7) == [ReplyReceived(7, b"question"), CallEnded(7)]
+        await wires.answers(robot, inbox, 7)
 
     async def test_several_replies_come_in_order(self, wire: wires.Wire) -> None:
         def count(call: IncomingCall) -> None:
@@ -121,8 +119,7 @@ class TestEveryWire:
         service = wire.service("cloud", "later")
         await service.start(wires.echo)
         await inbox.wait_for(ServiceAppeared("cloud", "later"))
-        robot.call("cloud", 1, b"question")
-        assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
+        await wires.answers(robot, inbox, 1)
 
     async def test_a_service_that_has_appeared_can_be_called_as_soon_as_that_is_heard(
         self, wire: wires.Wire
@@ -150,8 +147,7 @@ class TestEveryWire:
 
     async def test_an_empty_message_is_a_message(self, wire: wires.Wire) -> None:
         robot, inbox, _ = await wires.connected(wire)
-        robot.call("cloud", 1, b"")
-        assert await inbox.of_call(1) == [ReplyReceived(1, b""), CallEnded(1)]
+        await wires.answers(robot, inbox, 1, b"")
 
     async def test_many_calls_at_once_with_answers_from_other_threads(
         self, wire: wires.Wire
@@ -286,8 +282,7 @@ class TestEveryWire:
         refused = wires.refusal_of(await inbox.of_call(1))
         assert refused.code == "too_large"
         assert str(wires.MAX_BYTES) in refused.text
-        robot.call("cloud", 2, bytes(wires.MAX_BYTES))
-        assert await inbox.of_call(2) == [ReplyReceived(2, bytes(wires.MAX_BYTES)), CallEnded(2)]
+        await wires.answers(robot, inbox, 2, bytes(wires.MAX_BYTES))
 
     async def test_a_reply_that_is_too_large_is_dropped(self, wire: wires.Wire) -> None:
         def answer(call: IncomingCall) -> None:
@@ -304,9 +299,7 @@ class TestEveryWire:
             pytest.skip("a launched service has one robot")
         calls = wires.Received()
         robot, _, _ = await wires.connected(wire, calls)
-        other, inbox = wire.robot("cloud"), wires.Inbox()
-        other.start(inbox)
-        await inbox.wait_for(ServiceAppeared("cloud", "b1"))
+        other, inbox = await wires.joined(wire)
         robot.call("cloud", 1, b"")
         orphan = await calls.next()
         await robot.close()
@@ -321,11 +314,8 @@ class TestEveryWire:
             pytest.skip("the robot's next process launches another one")
         robot, _, _ = await wires.connected(wire)
         await robot.close()
-        again, inbox = wire.robot("cloud"), wires.Inbox()
-        again.start(inbox)
-        await inbox.wait_for(ServiceAppeared("cloud", "b1"))
-        again.call("cloud", 1, b"question")
-        assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
+        again, inbox = await wires.joined(wire)
+        await wires.answers(again, inbox, 1)
 
     async def test_a_closed_robot_delivers_nothing_more(self, wire: wires.Wire) -> None:
         calls = wires.Received()
@@ -385,17 +375,8 @@ class TestEveryWire:
 @pytest.mark.parametrize("kind", ["tcp", "tls", "udp", "unix", "launched"])
 class TestProcesses:
     @pytest.fixture
-    def wire(
-        self, kind: str, socket_directory: Path, robot_tls: TlsFiles, service_tls: TlsFiles
-    ) -> wires.StreamWire:
-        if kind in ("tls", "udp"):
-            wire = wires.StreamWire(
-                kind, socket_directory, robot_tls=robot_tls, service_tls=service_tls
-            )
-        elif kind == "launched":
-            wire = wires.StreamWire("unix", socket_directory, launched=True)
-        else:
-            wire = wires.StreamWire(kind, socket_directory)
+    def wire(self, kind: str, wire_of: Callable[[str], wires.StreamWire]) -> wires.StreamWire:
+        wire = wire_of(kind)
         wire.lease_ms = wires.LEASE_MS
         return wire
 

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import functools
 import socket
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from tests.contracts.wires import (
     Inbox,
     StreamWire,
     Visitor,
+    answers,
     assert_matches,
     connected,
     echo,
@@ -202,19 +204,8 @@ class TestStreams:
 
 
 @pytest.fixture(params=["tcp", "tls", "udp"])
-def any_stream(
-    request: pytest.FixtureRequest,
-    socket_directory: Path,
-    robot_tls: TlsFiles,
-    service_tls: TlsFiles,
-) -> StreamWire:
-    encrypted = request.param in ("tls", "udp")
-    return StreamWire(
-        request.param,
-        socket_directory,
-        robot_tls=robot_tls if encrypted else None,
-        service_tls=service_tls if encrypted else None,
-    )
+def any_stream(request: pytest.FixtureRequest, wire_of: Callable[[str], StreamWire]) -> StreamWire:
+    return wire_of(request.param)
 
 
 class TestDefects:
@@ -233,13 +224,11 @@ class TestDefects:
         robot.call("cloud", 1, b"bad")
         await inbox.wait_for(ServiceVanished("cloud", "b1"))
         assert CallEnded(1) in inbox
-        other.call("cloud", 1, b"good")
-        assert await of_other.of_call(1) == [ReplyReceived(1, b"good"), CallEnded(1)]
+        await answers(other, of_other, 1, b"good")
         assert ServiceVanished("cloud", "b1") not in of_other
         # It may come again.
         await inbox.wait(lambda _: inbox.count(ServiceAppeared("cloud", "b1")) == 2)
-        robot.call("cloud", 2, b"good")
-        assert await inbox.of_call(2) == [ReplyReceived(2, b"good"), CallEnded(2)]
+        await answers(robot, inbox, 2, b"good")
         (defect,) = [fields for name, fields in any_stream.events if name == "defect"]
         assert defect["reason"] == "RuntimeError: year 10000"
         assert "in answer" in str(defect["traceback"])
@@ -262,8 +251,7 @@ class TestDefects:
         await inbox.wait_for(ServiceVanished("cloud", "b1"))
         assert CallEnded(1) in inbox
         await inbox.wait(lambda _: inbox.count(ServiceAppeared("cloud", "b1")) == 2)
-        robot.call("cloud", 2, b"good")
-        assert await inbox.of_call(2) == [ReplyReceived(2, b"good"), CallEnded(2)]
+        await answers(robot, inbox, 2, b"good")
         assert told[0] == "defect RuntimeError: year 10000"
 
     async def test_while_nothing_but_time_passes(
@@ -341,11 +329,7 @@ class TestPeers:
                 await visitor.say(HELLO + frames.encode_frame(frames.CALL, 1, b"much"))
             await until(lambda: tcp.heard().count(("robot_connected", "", None)) == 3)
             for number in range(20):
-                robot.call("cloud", number, b"question")
-                assert await inbox.of_call(number) == [
-                    ReplyReceived(number, b"question"),
-                    CallEnded(number),
-                ]
+                await answers(robot, inbox, number)
             lost = ("robot_disconnected", "", "does not read what it is sent")
             await until(lambda: tcp.heard().count(lost) == 2, lambda: tcp.events)
         assert ServiceVanished("cloud", "b1") not in inbox
@@ -370,11 +354,7 @@ class TestPeers:
                 await visitor.say(HELLO)
                 await until(functools.partial(are_connected, number))
                 await visitor.say(frames.encode_frame(frames.CALL, 1, b"much"))
-                robot.call("cloud", number, b"question")
-                assert await inbox.of_call(number) == [
-                    ReplyReceived(number, b"question"),
-                    CallEnded(number),
-                ]
+                await answers(robot, inbox, number)
             lost = "does not read what it is sent, and others need the memory"
             await until(lambda: ("robot_disconnected", "", lost) in tcp.heard())
             assert sum(link.unsent_bytes for link in service._links) <= 2 * MAX_BYTES
@@ -485,8 +465,7 @@ class TestPeers:
             await small.say(little[1000:] + frames.encode_goodbye("done"))
             decoder = frames.FrameDecoder(MAX_BYTES)
             assert [frame.kind for frame in decoder.feed(await small.hear())][1] == frames.LAST
-        robot.call("cloud", 1, b"question")
-        assert await inbox.of_call(1) == [ReplyReceived(1, b"question"), CallEnded(1)]
+        await answers(robot, inbox, 1)
 
     @pytest.mark.parametrize(
         ("frame", "reason"),

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import datetime as dt
-import ipaddress
 import itertools
 import os
 import signal
@@ -22,9 +20,6 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
 from tests.ports import free_port
 from tests.processes.faults import PATIENT
 
@@ -264,56 +259,6 @@ def unused_endpoint(protocol: str, directory: Path) -> str:
     return f"{protocol}/127.0.0.1:{free_port()}"
 
 
-class Authority:
-    """Certifies, with keys that are made for the test."""
-
-    def __init__(self, directory: Path) -> None:
-        self.directory = directory
-        directory.mkdir()
-        self._key = ec.generate_private_key(ec.SECP256R1())
-        self._name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, directory.name)])
-        self._certificate = self._certify(self._name, self._key.public_key())
-
-    def issue(self, name: str, *usages: x509.ObjectIdentifier) -> TlsFiles:
-        key = ec.generate_private_key(ec.SECP256R1())
-        subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
-        certificate = self._certify(subject, key.public_key(), usages)
-        place = self.directory / name
-        place.mkdir()
-        files = TlsFiles(place / "authority.pem", place / "certificate.pem", place / "key.pem")
-        pem = serialization.Encoding.PEM
-        files.authority.write_bytes(self._certificate.public_bytes(pem))
-        files.certificate.write_bytes(certificate.public_bytes(pem))
-        files.key.write_bytes(
-            key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-        )
-        return files
-
-    def _certify(
-        self,
-        subject: x509.Name,
-        public_key: ec.EllipticCurvePublicKey,
-        usages: tuple[x509.ObjectIdentifier, ...] = (),
-    ) -> x509.Certificate:
-        now = dt.datetime.now(dt.UTC)
-        is_authority = not usages
-        names = [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
-        builder = (
-            x509.CertificateBuilder()
-            .subject_name(subject)
-            .issuer_name(self._name)
-            .public_key(public_key)
-            .serial_number(x509.random_serial_number())
-            .not_valid_before(now - dt.timedelta(hours=1))
-            .not_valid_after(now + dt.timedelta(days=1))
-            .add_extension(x509.BasicConstraints(ca=is_authority, path_length=None), critical=True)
-        )
-        if not is_authority:
-            builder = builder.add_extension(x509.ExtendedKeyUsage(usages), critical=False)
-            builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-        return builder.sign(self._key, hashes.SHA256())
-
-
 WIRES = ["in_process", "tcp", "tls", "udp", "unix", "launched"]
 
 
@@ -354,6 +299,22 @@ async def connected(
         assert isinstance(robot, StreamRobotTransport)
         await until(lambda: robot.sends_datagrams("cloud"))
     return robot, inbox, serving
+
+
+async def joined(wire: Wire) -> tuple[RobotTransport, Inbox]:
+    """Return a robot's end, once it sees the service."""
+    robot, inbox = wire.robot("cloud"), Inbox()
+    robot.start(inbox)
+    await inbox.wait_for(ServiceAppeared("cloud", "b1"))
+    return robot, inbox
+
+
+async def answers(
+    robot: RobotTransport, inbox: Inbox, call: int, question: bytes = b"question"
+) -> None:
+    """Ask a service that echoes; nothing else must come of it."""
+    robot.call("cloud", call, question)
+    assert await inbox.of_call(call) == [ReplyReceived(call, question), CallEnded(call)]
 
 
 def refusal_of(events: list[TransportEvent]) -> Refused:

@@ -105,6 +105,14 @@ class Site:
             f"{role} to be healthy: {self.engine.run('docker', 'logs', container)}",
         )
 
+    def up(self) -> None:
+        """Start the cloud, and then the robot, which sees it."""
+        self.compose("cloud", "up", "-d")
+        self.wait_for_health("cloud")
+        with self.then("service_appeared", service=self.endpoint):
+            self.compose("robot", "up", "-d")
+        self.wait_for_health("robot")
+
     def address(self) -> str:
         networks = self.engine.inspect(self.container("cloud"))["NetworkSettings"]["Networks"]
         return str(networks[self.name]["IPAddress"])
@@ -148,11 +156,7 @@ def site(
 
 def test_the_cloud_is_killed_paused_cut_off_and_moved(site: Site, engine: Engine) -> None:
     docker = engine.docker
-    site.compose("cloud", "up", "-d")
-    site.wait_for_health("cloud")
-    with site.then("service_appeared", service=site.endpoint):
-        site.compose("robot", "up", "-d")
-    site.wait_for_health("robot")
+    site.up()
     cloud = site.container("cloud")
 
     def harm(*strike: Callable[[], object], heal: Callable[[], object]) -> None:
@@ -207,11 +211,7 @@ def test_the_cloud_is_killed_paused_cut_off_and_moved(site: Site, engine: Engine
 def test_a_robot_that_dies_goes_on_but_no_engine_starts_one(site: Site, engine: Engine) -> None:
     if engine.restart is None:
         pytest.skip("an engine that is not the tests' own is not restarted")
-    site.compose("cloud", "up", "-d")
-    site.wait_for_health("cloud")
-    with site.then("service_appeared", service=site.endpoint):
-        site.compose("robot", "up", "-d")
-    site.wait_for_health("robot")
+    site.up()
 
     # Its process dies, in the midst of a trial: it goes on with nobody there.
     with site.then("resumed_trial"):
@@ -245,10 +245,7 @@ def test_a_robot_that_dies_goes_on_but_no_engine_starts_one(site: Site, engine: 
 def test_keys_are_rotated_and_a_robot_is_revoked_where_they_are_mounted(
     site: Site, engine: Engine
 ) -> None:
-    site.compose("cloud", "up", "-d")
-    site.wait_for_health("cloud")
-    with site.then("service_appeared", service=site.endpoint):
-        site.compose("robot", "up", "-d")
+    site.up()
     cloud = site.container("cloud")
 
     def reloaded(count: int) -> bool:

@@ -1,18 +1,14 @@
-"""The images: built of this tree, hardened, and what runs in them decides as it does outside."""
+"""The images: built of this tree and hardened. What runs in them decides as outside: Compose's."""
 
 from __future__ import annotations
 
-import json
-import shutil
 import subprocess
 import sys
 import tomllib
-import uuid
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.deploy.docker import ROOT, USER, Engine, Images, give_to, holdfast, wait_until
+from tests.deploy.docker import ROOT, USER, Engine, Images, holdfast
 
 HARDENED = (
     *("--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL"),
@@ -20,23 +16,6 @@ HARDENED = (
 )
 CONFIGURATION = ROOT / "examples/peg_in_hole_2d.yaml"
 ROLES = pytest.mark.parametrize("role", ["cloud", "robot"])
-
-
-@pytest.fixture
-def container(engine: Engine) -> Iterator[str]:
-    """Return a name for a container, which is gone afterwards."""
-    name = f"holdfast-test-{uuid.uuid4().hex[:8]}"
-    yield name
-    engine.run("docker", "rm", "--force", "--volumes", name)
-
-
-@pytest.fixture
-def network(engine: Engine) -> Iterator[str]:
-    """Return a network, which is gone afterwards."""
-    name = f"holdfast-test-{uuid.uuid4().hex[:8]}"
-    engine.docker("network", "create", name)
-    yield name
-    engine.docker("network", "rm", name)
 
 
 def test_the_containerfile_has_no_bad_habits() -> None:
@@ -92,35 +71,3 @@ def test_keys_of_another_user_are_named(engine: Engine, images: Images, tmp_path
     assert done.returncode == 2, done.stderr
     assert "Permission denied; this process is user 10001" in done.stderr
     assert "Traceback" not in done.stderr
-
-
-def test_a_robot_in_a_container_decides_as_outside(
-    engine: Engine, images: Images, container: str, network: str, tmp_path: Path
-) -> None:
-    """A service in the one, a robot in the other; each hears of its end, and leaves nobody."""
-    holdfast("keys", "keys", "--host", "cloud", cwd=tmp_path)
-    holdfast("run", CONFIGURATION, "--trials", 2, "--out", "calm", cwd=tmp_path)
-    runs = tmp_path / "runs"
-    runs.mkdir()
-    give_to(USER, tmp_path / "keys", runs)
-    engine.docker(
-        *("run", "-d", "--name", container, "--network", network, "--network-alias", "cloud"),
-        *(*HARDENED, "--pids-limit", 256, "-v", f"{tmp_path}/keys/service:/keys:ro", images.cloud),
-    )
-
-    def health() -> str:
-        return str(engine.inspect(container)["State"]["Health"]["Status"])
-
-    wait_until(lambda: health() == "healthy", "the service to be healthy")
-    engine.docker(
-        *("run", "--rm", "--network", network, *HARDENED, "-v", f"{runs}:/runs"),
-        *("-v", f"{CONFIGURATION}:/config/robot.yaml:ro", "-v", f"{tmp_path}/keys/robot:/keys:ro"),
-        *(images.robot, "run", "robot.yaml", "--out", "/runs/run", "--trials", 2),
-        *("--service", "tls/cloud:7447", "--tls", "/keys", "--recovery", "never"),
-    )
-    holdfast("compare", "calm", "runs/run", cwd=tmp_path)
-    summary = json.loads((runs / "run/summary.json").read_text())
-    assert list(summary["sensing_decisions_by_service"]) == ["tls/cloud:7447"]
-    engine.docker("stop", "--time", 60, container)
-    assert engine.inspect(container)["State"]["ExitCode"] == 0
-    shutil.rmtree(runs)

@@ -5,6 +5,7 @@ The places come from the structs themselves: a setting that is added is attacked
 
 from __future__ import annotations
 
+import collections
 import itertools
 import random
 from collections.abc import Iterator, Mapping
@@ -14,13 +15,16 @@ import msgspec
 import numpy as np
 from tests.fuzz import corpus
 from tests.fuzz.hostile_settings import NumericKey, keys_of
+from tests.fuzz.mutations import Mutator
 from tests.fuzz.odd_values import STORMS, OddValues, replaced
 from tests.questions import request_of
 
 from holdfast.config import registry
 from holdfast.planning.belief import Belief
+from holdfast.planning.inputs import Sensed
 from holdfast.planning.planner import PlanningState, encode_checkpoint
 from holdfast.planning.settings import (
+    ActiveSensingSettings,
     Estimator,
     Method,
     ParticleFilterSettings,
@@ -29,6 +33,8 @@ from holdfast.planning.settings import (
 )
 from holdfast.protocol.messages import (
     CHECKSUM_SIZE,
+    MAX_WORD,
+    Request,
     encode,
     settings_digest,
     unpack_configuration,
@@ -195,6 +201,58 @@ def checkpoints_in_obstacles(chance: random.Random) -> Iterator[bytes]:
                 checkpoint=encode_checkpoint(state),
             )
         )
+
+
+def nearly_right(chance: random.Random, session: bytes, changes: int) -> Request:
+    """Return what an honest robot might ask, but for some changes."""
+    request = chance.choice(corpus.requests(session, chance.choice((1, 2, 3))))
+    words = (0, 1, 2, 7, 64, 2**31, MAX_WORD)
+    for _ in range(changes):
+        field = chance.choice(("number", "trial", "step", "sensed", "digest", "inputs", "own"))
+        value: object = chance.choice(words)
+        match field:
+            case "sensed":
+                value = not request.sensed
+            case "digest":
+                value = chance.randbytes(16)
+            case "inputs":
+                kept = list(request.inputs)
+                chance.shuffle(kept)
+                shown = chance.choice((b"", b"\0" * 8, b"\xff" * 8, bytes(8 * 4096)))
+                kept.append(Sensed(chance.choice(words), chance.choice((0, 1, 99)), shown))
+                value = () if request.checkpoint is not None else tuple(kept)
+            case "own":
+                field = "session_configuration"
+                planning = PlanningSettings(
+                    particle_filter=ParticleFilterSettings(
+                        num_particles=chance.choice((1, 4, 150))
+                    ),
+                    active_sensing=ActiveSensingSettings(num_observation_samples=2, num_cores=1),
+                    sensing_interval=chance.choice((0, 5, 10**6)),
+                )
+                value = corpus.session_configuration_of(seed=chance.randrange(3), planning=planning)
+        request = msgspec.structs.replace(request, **{field: value})
+    return request
+
+
+def spoilt_requests(chance: random.Random) -> Iterator[bytes]:
+    """Yield spoilt, wrong, honest and replayed requests, of sessions of one's own, and noise."""
+    own = [chance.randbytes(16) for _ in range(60)]
+    mutator = Mutator(chance, [corpus.content_of(each) for each in corpus.requests()])
+    sent: collections.deque[bytes] = collections.deque([b""], maxlen=500)
+    while True:
+        match chance.choices(("spoilt", "noise", "own", "replayed"), (35, 15, 40, 10))[0]:
+            case "own":
+                session = chance.choice((*own, chance.randbytes(16)))
+                sent.append(encode(nearly_right(chance, session, chance.choice((0, 1, 1, 4)))))
+            case "replayed":
+                sent.append(chance.choice(sent))
+            case kind:
+                size = chance.choice((0, 1, 2, 16, 75, 300, 2000, 300_000))
+                content = mutator.spoilt() if kind == "spoilt" else chance.randbytes(size)
+                # Without its checksum, no more of it is looked at.
+                sent.append(with_checksum(content) if chance.random() < 0.8 else content)
+        yield sent[-1]
 
 
 def _hostile_sections(chance: random.Random, name: str) -> Iterator[tuple[int, bytes]]:

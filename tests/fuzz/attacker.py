@@ -40,9 +40,13 @@ from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
 from tests.fuzz import corpus, neighbours
-from tests.fuzz.attack_messages import checkpoints_in_obstacles, hostile_settings, odd_requests
+from tests.fuzz.attack_messages import (
+    checkpoints_in_obstacles,
+    hostile_settings,
+    odd_requests,
+    spoilt_requests,
+)
 from tests.fuzz.honest_robots import HonestRobots
-from tests.fuzz.hostile_client import HostileMessages
 from tests.fuzz.measuring import Watch, flatness
 from tests.ports import free_port
 from tests.processes.faults import Service, Site
@@ -90,52 +94,31 @@ Way: TypeAlias = Callable[[Target, random.Random], None]
 # -- ways of attacking ---------------------------------------------------------------------------
 
 
-def _converse(target: Target, name: str, payloads: Iterator[tuple[bytes, bool]]) -> None:
-    """Send calls, or bytes that are no call, over one link after the other; read what comes."""
-    numbers = itertools.count(1)
-    while target.goes_on:
-        with contextlib.suppress(OSError, AssertionError), target.link() as link:
-            open_calls = 0
-            for payload, is_call in itertools.islice(payloads, _CALLS_OF_A_LINK):
-                if target.until.is_set():
-                    return
-                if is_call:
+def _conversation(name: str, draw: Callable[[random.Random], Iterator[bytes]]) -> Way:
+    """Return what sends drawn calls over one link after the other, and reads what comes."""
+
+    def attack(target: Target, chance: random.Random) -> None:
+        numbers, payloads = itertools.count(1), draw(chance)
+        while target.goes_on:
+            with contextlib.suppress(OSError, AssertionError), target.link() as link:
+                open_calls = 0
+                for payload in itertools.islice(payloads, _CALLS_OF_A_LINK):
+                    if target.until.is_set():
+                        return
                     link.send(CALL, next(numbers) % 2**32, payload)
                     open_calls += 1
-                else:
-                    link.say(payload)
-                target.counts[name] += 1
-                while select.select([link.socket], [], [], 0)[0] or open_calls >= _OUTSTANDING:
-                    try:
-                        frame = link.receive(_ROOM_S)
-                    except TimeoutError:
-                        open_calls = 0  # what was asked is hard, or was no call
-                        break
-                    if frame is None:
-                        raise ConnectionError
-                    open_calls -= frame.kind not in (PING,)
+                    target.counts[name] += 1
+                    while select.select([link.socket], [], [], 0)[0] or open_calls >= _OUTSTANDING:
+                        try:
+                            frame = link.receive(_ROOM_S)
+                        except TimeoutError:
+                            open_calls = 0  # what was asked is hard
+                            break
+                        if frame is None:
+                            raise ConnectionError
+                        open_calls -= frame.kind not in (PING,)
 
-
-def _odd_values(target: Target, chance: random.Random) -> None:
-    """Values of every type at every place of a request."""
-    _converse(target, "odd values", ((each, True) for each in odd_requests(chance)))
-
-
-def _hostile_settings(target: Target, chance: random.Random) -> None:
-    """Every number of the settings and of the problems at its bound and beyond."""
-    _converse(target, "hostile settings", ((each, True) for each in hostile_settings(chance)))
-
-
-def _checkpoints(target: Target, chance: random.Random) -> None:
-    """States that no robot can be in, in which every move takes a thousand times as long."""
-    payloads = ((each, True) for each in checkpoints_in_obstacles(chance))
-    _converse(target, "checkpoints in obstacles", payloads)
-
-
-def _messages(target: Target, chance: random.Random) -> None:
-    """Spoilt, replayed and wrong requests, of the attacker's own sessions and of new ones."""
-    messages = iter(HostileMessages(chance.randrange(2**32)))
-    _converse(target, "messages", ((each.payload, each.is_call) for each in messages))
+    return attack
 
 
 def _cut_frames(target: Target, chance: random.Random) -> None:
@@ -257,10 +240,10 @@ def _flood(target: Target, chance: random.Random) -> None:
 
 
 WAYS: dict[str, Way] = {
-    "odd": _odd_values,
-    "settings": _hostile_settings,
-    "checkpoints": _checkpoints,
-    "messages": _messages,
+    "odd": _conversation("odd values", odd_requests),
+    "settings": _conversation("hostile settings", hostile_settings),
+    "checkpoints": _conversation("checkpoints in obstacles", checkpoints_in_obstacles),
+    "messages": _conversation("messages", spoilt_requests),
     "cut": _cut_frames,
     "abandoned": _abandoned,
     **{kind: _as_neighbour(kind) for kind in ("deaf", "slow", "scanner", "greetings")},

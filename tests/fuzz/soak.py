@@ -3,10 +3,9 @@
     python -m tests.fuzz.soak --minutes 10 --seed 1
 
 Two services, one that may remember eight robots and one that may remember a thousand, have visitors
-without end: thousands of short sessions, and robots (`holdfast run`) that are killed in the middle
-of a call and resumed, or not. Beside them one robot runs all the time, and its two services are
-killed and started again. What the processes hold is measured from outside; when it counts as flat
-is said in ``measuring.py``.
+without end (the attacker's sessions that are left at once, in order or in the midst of a call).
+Beside them one robot runs all the time, and its two services are killed and started again. What the
+processes hold is measured from outside; when it counts as flat is said in ``measuring.py``.
 """
 
 from __future__ import annotations
@@ -26,59 +25,11 @@ from typing import Any
 import msgspec
 from tests.fuzz.honest_robots import compared
 from tests.fuzz.measuring import Watch, flatness
-from tests.processes.faults import PROBLEMS, Robot, Service, Site, document_of, events_of
+from tests.processes.faults import Service, Site, document_of, events_of
 
 _SMALL, _BIG = "8", "1000"
 _LIVES_S = (1.5, 6.0)
 """How long a service of the long-lived robot lives."""
-
-
-class _Passers:
-    """Robots that begin, are killed or not, are resumed or not, one after another."""
-
-    def __init__(self, site: Site, services: list[Service], seed: int) -> None:
-        self._site = site
-        self._services = services
-        self._chance = random.Random(seed)
-        self._stopped = threading.Event()
-        self.killed = self.finished = self.trials = 0
-        self.findings: list[str] = []
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._stopped.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        count = 0
-        while not self._stopped.is_set() and not self.findings:
-            count += 1
-            document = document_of(self._chance.choice(PROBLEMS), max_steps=60, seed=count)
-            file = self._site.configure(document, f"passer-{count}", recovery={"launch": "never"})
-            service = self._chance.choice(self._services)
-            robot = self._start(file, service, count, resume=False)
-            if self._chance.random() < 0.6:
-                # Long enough to have asked, usually.
-                self._stopped.wait(self._chance.uniform(0.4, 1.6))
-                robot.process.kill()
-                robot.wait()
-                self.killed += 1
-                if self._chance.random() < 0.5 or not (robot.out / "journal.bin").exists():
-                    continue
-                robot = self._start(file, service, count, resume=True)
-            if robot.wait() != 0:
-                self.findings.append(robot.account()[-2000:])
-                return
-            trials, findings = compared(file, robot.out, 200)
-            self.finished += 1
-            self.trials += trials
-            self.findings += findings
-
-    def _start(self, file: Path, service: Service, count: int, *, resume: bool) -> Robot:
-        return self._site.run(
-            file, "--rate", "100", services=[service], out=f"passer-{count}-out", resume=resume
-        )
 
 
 class _ComeAndGo:
@@ -133,13 +84,12 @@ def run_soak(
         visitors = [
             site.process(
                 sys.executable,
-                *("-m", "tests.fuzz.visitors", service.endpoint),
-                *("--seconds", str(seconds), "--seed", str(seed + index)),
+                *("-m", "tests.fuzz.attacker", "--attack", service.endpoint, "--ways", "abandoned"),
+                *("--minutes", str(seconds / 60.0), "--seed", str(seed + index)),
                 variables={"PYTHONPATH": str(Path(__file__).parents[2])},
             )
             for index, service in enumerate(visited.values())
         ]
-        passers = _Passers(site, list(visited.values()), seed)
         coming = _ComeAndGo(own, seed)
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0.0:
@@ -151,18 +101,13 @@ def run_soak(
             }
             tell(f"{left:.0f} s to go, MB held: {memory}")
         samples = {name: watch.stop() for name, watch in watches.items()}
-        passers.stop()
         coming.stop()
+        findings += coming.failures
         reports = []
         for visitor in visitors:
-            visitor.wait()
-            lines = [line for line in visitor.output.splitlines() if line.startswith("{")]
-            if not lines:
-                findings.append(f"a visitor says: {visitor.output[-2000:]}")
-                continue
-            reports.append(json.loads(lines[-1]))
-            findings += reports[-1].pop("wrong")
-        findings += passers.findings + coming.failures
+            if visitor.wait() != 0:
+                findings.append(f"a visitor fails: {visitor.account()[-2000:]}")
+            reports += [json.loads(line) for line in visitor.output.splitlines() if line[:1] == "{"]
         robot.signal(signal.SIGTERM)
         code = robot.wait()
         if code not in (-signal.SIGTERM, 128 + signal.SIGTERM):
@@ -179,11 +124,6 @@ def run_soak(
             findings += [f"{name}: {fault}" for fault in faults]
         events = events_of(robot.out)
         figures |= {
-            "passers": {
-                "killed": passers.killed,
-                "finished": passers.finished,
-                "trials_compared": passers.trials,
-            },
             "long_lived_robot": {
                 "trials": sum(event["event"] == "trial" for event in events),
                 "trials_compared": trials,

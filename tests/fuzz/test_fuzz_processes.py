@@ -89,7 +89,8 @@ def test_each_built_in_problem_is_asked_about_states_in_an_obstacle(name: str) -
         .world.collides(np.array([IN_AN_OBSTACLE[name]]))
         .all()
     )
-    for payload in itertools.islice(checkpoints_in_obstacles(random.Random(1)), len(BUILT_IN)):
+    # Draws 300 particles for each.
+    for payload in itertools.islice(checkpoints_in_obstacles(random.Random(36)), len(BUILT_IN)):
         configuration = decode_request(payload).session_configuration
         assert configuration is not None
         if configuration.problem == name:

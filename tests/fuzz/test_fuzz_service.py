@@ -9,7 +9,6 @@ from __future__ import annotations
 import random
 from typing import Any
 
-import msgspec
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
@@ -22,15 +21,12 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 from tests.fuzz import corpus, strategies
-from tests.fuzz.attack_messages import hostile_settings, odd_requests
+from tests.fuzz.attack_messages import hostile_settings, nearly_right, odd_requests
 from tests.fuzz.targets import SPECIMENS
 from tests.unit.test_protocol_service import Bench, Robot, content, planning_of
 
-from holdfast.planning.inputs import Sensed
 from holdfast.protocol.messages import (
-    MAX_WORD,
     Request,
-    SessionConfiguration,
     encode,
     with_checksum,
 )
@@ -130,34 +126,7 @@ class HostileRobots(RuleBasedStateMachine):
 
     @rule(key=KEYS, seed=st.integers(0, 2**32), changes=st.integers(1, 4))
     def a_request_that_is_nearly_right(self, key: int, seed: int, changes: int) -> None:
-        chance = random.Random(seed)
-        request = chance.choice(corpus.requests(self.session_of(key), chance.choice((1, 2, 3))))
-        words = (0, 1, 2, 7, 64, 2**31, MAX_WORD)
-        for _ in range(changes):
-            match chance.choice(("number", "trial", "step", "sensed", "digest", "observed", "own")):
-                case "sensed":
-                    request = msgspec.structs.replace(request, sensed=not request.sensed)
-                case "digest":
-                    request = msgspec.structs.replace(request, digest=chance.randbytes(16))
-                case "observed" if request.checkpoint is None:
-                    kept = list(request.inputs)
-                    chance.shuffle(kept)
-                    shown = chance.choice((b"", b"\0" * 8, b"\xff" * 8, bytes(8 * 4096)))
-                    kept.append(Sensed(chance.choice(words), chance.choice((0, 1, 99)), shown))
-                    request = msgspec.structs.replace(request, inputs=tuple(kept))
-                case "own":
-                    planning = planning_of(chance.choice((0, 5, 10**6)), chance.choice((1, 4, 150)))
-                    session_configuration = SessionConfiguration(
-                        "capsule_robot", {}, {}, planning, chance.randrange(3)
-                    )
-                    request = msgspec.structs.replace(
-                        request, session_configuration=session_configuration
-                    )
-                case "number" | "trial" | "step" as field:
-                    request = msgspec.structs.replace(request, **{field: chance.choice(words)})
-                case _:
-                    pass
-        self.hostile(encode(request))
+        self.hostile(encode(nearly_right(random.Random(seed), self.session_of(key), changes)))
 
     @rule(key=KEYS, epoch=WORDS, index=st.integers(0, 1000))
     def a_valid_request_of_any_epoch(self, key: int, epoch: int, index: int) -> None:

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from tests.command_line import run_here
 from tests.processes.faults import holdfast
 
 CONFIGURATION = """\
@@ -30,9 +31,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def test_outcomes(runs: Path) -> None:
-    done = holdfast(runs, "compare", "--outcomes", "first", "random")
-    assert done.returncode == 0, done.stderr
+def test_outcomes(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    done = run_here(capsys, runs, "compare", "--outcomes", "first", "random")
+    assert done.code == 0, done.stderr
     head, columns, *rows = done.stdout.splitlines()
     assert head == "random against first, 6 trials paired by number:"
     assert columns.split() == ["baseline", "run", "effect", "95%", "interval"]
@@ -45,20 +46,20 @@ def test_outcomes(runs: Path) -> None:
     assert rows[-3].endswith("counts as its limit, 40 steps.")
 
 
-def test_json(runs: Path) -> None:
-    done = holdfast(runs, "compare", "--outcomes", "--json", "first", "random", "first")
+def test_json(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    done = run_here(capsys, runs, "compare", "--outcomes", "--json", "first", "random", "first")
     found = json.loads(done.stdout)
     assert (found["baseline"], found["paired"], found["step_limit"]) == ("first", True, 40)
     itself = found["runs"][1]
     assert all(effect["interval"] is None for effect in itself["effects"])
 
 
-def test_other_worlds(runs: Path) -> None:
-    refused = holdfast(runs, "compare", "--outcomes", "first", "elsewhere")
-    assert refused.returncode == 2
+def test_other_worlds(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refused = run_here(capsys, runs, "compare", "--outcomes", "first", "elsewhere")
+    assert refused.code == 2
     assert "the seed is 4 here and 3 there" in refused.stderr
-    done = holdfast(runs, "compare", "--outcomes", "--unpaired", "first", "elsewhere")
-    assert done.returncode == 0
+    done = run_here(capsys, runs, "compare", "--outcomes", "--unpaired", "first", "elsewhere")
+    assert done.code == 0
     assert "6 trials not paired:" in done.stdout
 
 
@@ -72,7 +73,9 @@ def test_other_worlds(runs: Path) -> None:
         (["--outcomes", "first", "nothing"], "so no run to compare"),
     ],
 )
-def test_refusals(runs: Path, words: list[str], message: str) -> None:
-    done = holdfast(runs, "compare", *words)
-    assert done.returncode == 2
+def test_refusals(
+    runs: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = run_here(capsys, runs, "compare", *words)
+    assert done.code == 2
     assert message in done.stderr

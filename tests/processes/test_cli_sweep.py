@@ -6,6 +6,8 @@ import re
 import shlex
 from pathlib import Path
 
+import pytest
+from tests.command_line import run_here
 from tests.processes.faults import holdfast
 
 PROBLEM = """\
@@ -64,7 +66,7 @@ def test_a_process_that_ends_ctrl_c_and_resume(tmp_path: Path) -> None:
     }
 
 
-def test_refusals(tmp_path: Path) -> None:
+def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """None of them leaves anything behind."""
     (tmp_path / "peg.yaml").write_text(CONFIGURATION.replace("swept_peg:Peg", "peg_in_hole_2d"))
     for words, message in {
@@ -75,7 +77,7 @@ def test_refusals(tmp_path: Path) -> None:
         (*SET, "--resume"): "--resume needs --out",
         (*SET, "--seed", "1", "--set", "simulator.seed=2"): "both say what simulator.seed is",
     }.items():
-        refused = holdfast(tmp_path, "sweep", "peg.yaml", *words)
-        assert refused.returncode == 2
+        refused = run_here(capsys, tmp_path, "sweep", "peg.yaml", *words)
+        assert refused.code == 2
         assert message in refused.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["peg.yaml"]

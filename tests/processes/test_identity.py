@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from cryptography import x509
+from tests.command_line import run_here
 from tests.ports import free_port
 from tests.processes.faults import (
     LOCAL_RECOVERY,
@@ -36,79 +36,13 @@ def home(tmp_path: Path) -> Path:
     return tmp_path / "home"
 
 
-@pytest.fixture
-def elsewhere(tmp_path: Path) -> Iterator[Site]:
-    """Where another robot works."""
-    directory = tmp_path / "elsewhere"
-    directory.mkdir()
-    with Site(directory) as site:
-        yield site
-
-
-def cloud_of(site: Site, home: Path, *options: str) -> Service:
-    return site.service(
-        "--tls", str(home / "cloud"), *options, endpoint=f"tls/127.0.0.1:{free_port()}"
-    )
-
-
 def reload(cloud: Service, count: int = 1) -> LogEvent:
     cloud.process.signal(signal.SIGHUP)
     return cloud.process.wait_for("credentials_reloaded", count)
 
 
-def robot_beside(
-    home: Path,
-    cloud: Service,
-    site: Site,
-    elsewhere: Site,
-    references: References,
-    happens: Callable[[Story], None],
-) -> tuple[list[tuple[str, str]], Path]:
-    """Let anna run while berta's run goes on; return anna's changes of status, and her run."""
-    document = document_of(PEG)
-    bertas = Story(elsewhere, references, document)
-    found: list[tuple[list[tuple[str, str]], Path]] = []
-
-    def run_anna() -> None:
-        story = Story(site, references, document)
-        happens(story)
-        robot = story.run(cloud, options=("--tls", str(home / "anna")))
-        found.append((robot.statuses(), robot.out))
-
-    bertas.at("perform", 20, run_anna)
-    berta = bertas.run(cloud, options=("--tls", str(home / "berta")))
-    assert berta.statuses() == []
-    assert not [each for each in events_of(berta.out) if each["event"] == "refused"]
-    # One link, from the beginning to the end.
-    assert len(cloud.process.matching("robot_connected", robot="berta")) == 1
-    return found[0]
-
-
 def certificate_of(directory: Path) -> x509.Certificate:
     return x509.load_pem_x509_certificate((directory / "certificate.pem").read_bytes())
-
-
-def test_a_revoked_robot_is_cut_off_and_no_other(
-    home: Path, site: Site, elsewhere: Site, references: References
-) -> None:
-    cloud = cloud_of(site, home).start()
-
-    def happens(story: Story) -> None:
-        def revoke() -> None:
-            revoke_credentials(home, names=["anna"])
-            told = reload(cloud)
-            assert told["links_ended"] == told["num_revoked"] == 1
-            until = certificate_of(home / "cloud").not_valid_after_utc
-            assert told["valid_until"] == f"{until:%Y-%m-%d %H:%M} UTC"
-
-        story.at("perform", 20, revoke, story.status(LOCAL_RECOVERY))
-
-    statuses, out = robot_beside(home, cloud, site, elsewhere, references, happens)
-    assert statuses == [LOST]
-    told = " ".join(str(each.get("reason")) for each in events_of(out))
-    assert "has a certificate that has been revoked" in told
-    (ended,) = cloud.process.matching("robot_disconnected", robot="anna")
-    assert ended["reason"] == "has a certificate that has been revoked"
 
 
 def test_a_robot_without_a_certificate_has_the_name_that_it_says(
@@ -119,19 +53,23 @@ def test_a_robot_without_a_certificate_has_the_name_that_it_says(
     assert cloud.process.matching("robot_connected", robot="anna")
 
 
-def test_a_robot_with_the_certificate_of_another_is_refused(home: Path, site: Site) -> None:
-    file = site.configure(document_of(PEG), offload={"name": "berta"})
-    robot = site.run(file, "--tls", home / "anna", services=["tls/127.0.0.1:1"])
-    assert robot.wait() == 2
-    assert "offload.name 'berta': the certificate in" in robot.output
-    assert "is anna's; copy that robot's own credentials here" in robot.output
-
-
-def test_a_name_that_is_none_is_refused(site: Site) -> None:
-    file = site.configure(document_of(PEG), offload={"name": "no name!"})
-    robot = site.run(file, services=["tcp/127.0.0.1:1"])
-    assert robot.wait() == 2
-    assert "offload.name 'no name!': allowed are 1 to 100 letters" in robot.output
+@pytest.mark.parametrize(
+    ("name", "tls", "said"),
+    [
+        ("berta", True, "offload.name 'berta': the certificate in"),
+        ("berta", True, "is anna's; copy that robot's own credentials here"),
+        ("no name!", False, "offload.name 'no name!': allowed are 1 to 100 letters"),
+    ],
+)
+def test_a_name_that_is_not_the_robots_is_refused(
+    name: str, tls: bool, said: str, home: Path, site: Site, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = site.configure(document_of(PEG), offload={"name": name})
+    words = ["--tls", str(home / "anna"), "--service", "tls/127.0.0.1:1"]
+    words = words if tls else ["--service", "tcp/127.0.0.1:1"]
+    refused = run_here(capsys, site.directory, "run", str(file), "--out", "out", *words)
+    assert refused.code == 2
+    assert said in " ".join(refused.stderr.split())
 
 
 class Mounted:
@@ -224,6 +162,12 @@ def test_where_keys_are_mounted_a_rotation_and_then_a_revocation_take_effect(
     story.at("perform", 20, revoke, story.status(LOCAL_RECOVERY))
     robot = story.run(cloud, options=("--tls", str(home / "anna")))
     assert robot.statuses() == [LOST]
+    revoked = "has a certificate that has been revoked"
+    assert revoked in " ".join(str(each.get("reason")) for each in events_of(robot.out))
+    reloads = cloud.process.matching("credentials_reloaded", num_revoked=1)
+    assert sum(each["links_ended"] for each in reloads) == 1
+    (ended,) = cloud.process.matching("robot_disconnected", robot="anna")
+    assert ended["reason"] == revoked
     assert page(address, "/readyz") == (200, "ok\n")
     assert "\nholdfast_credentials_stale 0.0\n" in page(address, "/metrics")[1]
 

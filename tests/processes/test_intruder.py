@@ -10,17 +10,14 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
 import pytest
-from tests.intruder import Impostor, Intruder
-from tests.ports import free_port
+from tests.intruder import Intruder
 from tests.processes.faults import PATIENCE_S, References, Service, Site, Story, document_of
 from tests.processes.test_tls import secure
 from tests.questions import questions_of
-from tests.wire import GOODBYE, HELLO, RawLink, hello_of
 
 from holdfast.config.loader import load
 from holdfast.journal.journal import Journal
@@ -142,32 +139,3 @@ def test_each_message_at_each_moment_changes_nothing(
         assert not robot.matching(name), name
     assert cloud.process.process.poll() is None
     assert "Traceback" not in cloud.process.output
-
-
-def test_who_says_that_it_is_a_service_is_sent_away(
-    protocol: str, cloud: Service, stolen: Path
-) -> None:
-    with RawLink(cloud.endpoint, None if protocol == "tcp" else stolen) as link:
-        link.say(hello_of("service", "cloud", "another"))
-        kinds = [frame.kind for frame in link.until_the_end() if frame.kind != HELLO]
-    assert kinds == [GOODBYE]
-
-
-@pytest.fixture
-def impostor(stolen: Path) -> Iterator[Impostor]:
-    impostor = Impostor(free_port(), stolen)
-    yield impostor
-    impostor.close()
-
-
-def test_a_robots_certificate_is_not_a_services(
-    impostor: Impostor, keys: Path, site: Site, references: References
-) -> None:
-    """It listens where the robot looks for a service, and is never asked."""
-    cloud = secure(site, keys, "tls").start()
-    story = Story(site, references, DOCUMENT)
-    robot = story.run(impostor.endpoint, cloud, options=("--tls", str(keys / "ours" / "robot")))
-    assert impostor.knocked
-    assert not impostor.received
-    assert not robot.matching("service_appeared", service=impostor.endpoint)
-    assert robot.matching("service_appeared", service=cloud.endpoint)

@@ -29,14 +29,6 @@ def heard(end: socket.socket) -> list[str]:
     return end.recv(4096).decode().splitlines()
 
 
-def test_without_a_manager_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    manager = ServiceManager()
-    manager.ready()
-    manager.stopping(1.0)
-    manager.close()
-
-
 def test_its_variables_are_not_inherited(notified: socket.socket) -> None:
     manager = ServiceManager()
     assert "NOTIFY_SOCKET" not in os.environ

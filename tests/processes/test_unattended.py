@@ -81,35 +81,6 @@ def beats_in(manager: NotifySocket, seconds: float) -> int:
     return manager.count("WATCHDOG=1") - before
 
 
-class TestOneCommandRepeated:
-    def test_it_begins_goes_on_however_it_ended_and_is_complete(
-        self, site: Site, references: References
-    ) -> None:
-        document = document_of(PEG, max_steps=60, trials=2)
-        steps = sensing_steps(document)
-        cloud = site.service().start()
-        story = Story(site, references, document)
-        (site.directory / "out").mkdir()  # as a volume is that was just mounted
-        story.at("begin", 0, site.kill_robot)  # nothing is performed yet
-        story.at("sense", steps[1], site.kill_robot)
-        story.at("perform", steps[2] - 1, lambda: story.running.signal(signal.SIGTERM))
-        story.at("perform", 30, site.kill_robot, trial=1, afterwards=True)
-        options = ("--resume-if-begun", "--rate", "2000")
-
-        def command() -> int:
-            return site.run(story.file, *options, services=[cloud]).wait()
-
-        killed, ended = -signal.SIGKILL, 128 + signal.SIGTERM
-        codes = [command() for _ in range(6)]
-        assert codes == [killed, killed, ended, killed, 0, 0], story.running.account()
-        note = f"{story.running.out}: complete, with 2 trials"
-        assert [event["reason"] for event in story.running.events] == [note]
-        story.finish(story.running)
-        assert services_in_order(story.running) == [cloud.endpoint]  # each part was told of it
-        said = site.holdfast("compare", story.reference, story.running.out)
-        assert said.process.returncode == 0, said.account()
-
-
 def child_of(process: Process) -> int:
     """Return the id of the process that another one has started."""
     pid = process.pid
@@ -118,7 +89,10 @@ def child_of(process: Process) -> int:
 
 
 class TestRestart:
-    """``--restart``, as the first process of a container."""
+    """``--restart``, as the first process of a container.
+
+    What is not started again: unit/test_cli_restart.py, and after a reboot deploy/test_compose.py.
+    """
 
     OPTIONS = ("--resume-if-begun", "--restart", "--rate", "2000")
 
@@ -139,43 +113,6 @@ class TestRestart:
         told = robot.matching("process_ended")
         assert [event["reason"] for event in told] == ["was ended by SIGKILL"] * 2
         story.finish(robot)
-
-    def test_what_ends_it_in_order_ends_it_for_good(
-        self, site: Site, references: References
-    ) -> None:
-        document = document_of(PEG, max_steps=60)
-        story = Story(site, references, document)
-
-        def end() -> None:
-            os.kill(story.running.pid, signal.SIGTERM)
-
-        story.at("perform", 30, end)
-        robot = site.run(story.file, *self.OPTIONS)
-        assert robot.wait() == 128 + signal.SIGTERM, robot.account()
-        assert robot.matching("process_ended") == []
-        story.finish(site.run(story.file, *self.OPTIONS))
-
-    @pytest.mark.skipif(os.geteuid() != 0, reason="only root mounts")
-    def test_after_a_reboot_it_moves_only_when_told_to(
-        self, site: Site, references: References
-    ) -> None:
-        document = document_of(PEG, max_steps=60)
-        story = Story(site, references, document)
-        story.at("perform", 30, site.kill_robot)
-        robot = site.run(story.file, *self.OPTIONS)
-        assert robot.wait() == -signal.SIGKILL, robot.account()
-        site.wait_for_nobody()
-        performed = story.world.step
-        boot = site.directory / "boot_id"
-        boot.write_text("another\n")
-        booted = ("unshare", "--mount", "sh", "-c", f'mount --bind {boot} {BOOT_ID}; exec "$@"')
-        command = (*booted, "sh", *COMMAND)
-        robot = site.run(story.file, *self.OPTIONS, command=command)
-        assert robot.wait() == 5, robot.account()
-        assert robot.matching("process_ended") == []
-        assert story.world.step == performed
-        options = (*self.OPTIONS, "--after-reboot")
-        story.finish(site.run(story.file, *options, command=command))
 
 
 class TestHealth:
