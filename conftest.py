@@ -249,6 +249,14 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
         _end_unless_it_goes_on(item.config, 2.0)
 
 
+@pytest.fixture
+def workplace(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Return a directory in which commands are run."""
+    from tests.command_line import Workplace
+
+    return Workplace(tmp_path, capsys)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _signals_are_heard() -> None:
     """Let tests and their processes hear signals that a shell, or nohup, has its jobs ignore."""

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from tests.command_line import Said, run_here
+from tests.command_line import Workplace
 from tests.recordings import forget_steps, rewrite
 
 from holdfast.errors import HeldError
@@ -29,53 +29,10 @@ simulator: {num_trials: 6, max_steps: 80, seed: 3}
 """
 
 
-class Workplace:
-    """A directory in which commands are run."""
-
-    def __init__(self, directory: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        self.directory = directory
-        self._capsys = capsys
-        self.write("peg.yaml", PEG)
-
-    def write(self, name: str, text: str) -> None:
-        (self.directory / name).write_text(text)
-
-    def names(self) -> set[str]:
-        return {path.name for path in self.directory.iterdir()} - {"__pycache__"}
-
-    def run(self, *arguments: str, figures: bool = False) -> Said:
-        return run_here(self._capsys, self.directory, *arguments, figures=figures)
-
-    def runs(self, *arguments: str, figures: bool = False) -> Said:
-        """Run a command that is to come to its end; return what it says."""
-        said = self.run(*arguments, figures=figures)
-        assert said.code == 0, said
-        return said
-
-    def decided(self, out: str) -> list[tuple[str, ...]]:
-        """Return the table of trials, without the times."""
-        with (self.directory / out / "trials.csv").open() as file:
-            return [
-                tuple(value for key, value in row.items() if key != "mean_sensing_ms")
-                for row in csv.DictReader(file)
-            ]
-
-    def summary(self, out: str) -> dict[str, object]:
-        found: dict[str, object] = json.loads((self.directory / out / "summary.json").read_text())
-        return found
-
-    def fails(self, *arguments: str) -> str:
-        """Run a command that is to be refused; return what it says."""
-        said = self.run(*arguments)
-        assert (said.code, said.stdout) == (2, "")
-        assert said.stderr.startswith("holdfast: error: ")
-        assert "Traceback" not in said.stderr
-        return said.stderr
-
-
 @pytest.fixture
-def workplace(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Workplace:
-    return Workplace(tmp_path, capsys)
+def workplace(workplace: Workplace) -> Workplace:
+    workplace.write("peg.yaml", PEG)
+    return workplace
 
 
 def test_the_resolved_configuration_runs_again_to_the_same(workplace: Workplace) -> None:
