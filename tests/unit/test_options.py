@@ -82,7 +82,7 @@ def test_an_empty_path_is_not_the_current_directory(words: list[str], last_words
         (["nonsense"], "'nonsense' is no command; commands are run, serve, "),
         (["rnu", "peg.yaml"], "'rnu' is no command; did you mean run?"),
         (["--versoin"], "'--versoin' is no option of holdfast; did you mean --version?"),
-        (["peg.yaml"], "peg.yaml is no command; did you mean: holdfast run peg.yaml"),
+        (["peg.yaml", "--jobs", "2"], "no command; did you mean: holdfast run peg.yaml --jobs 2\n"),
         (["run", "peg.yaml", "--nonsense"], "--nonsense"),
         (["run", "peg.yaml", "again"], "again"),
         (["run", "peg.yaml", "--trials"], "--trials"),

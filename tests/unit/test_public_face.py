@@ -78,10 +78,6 @@ class TestMake:
         assert problem.limit_action(np.full(3, 9.0)).tolist() == [0.1, 0.1, 0.2]
         assert problem.model.peg_width == 0.5  # type: ignore[attr-defined]
 
-    def test_a_class_of_ones_own(self) -> None:
-        problem = hf.make_problem("studies.busy_room:BusyRoom")
-        assert isinstance(problem, hf.Problem)
-
     @pytest.mark.parametrize(
         ("name", "settings", "error", "message"),
         [
@@ -130,11 +126,6 @@ def test_the_loop_and_run_trial_decide_the_same() -> None:
     assert result.decisions.log.endswith(planner.digest(state))
 
 
-def test_load_configuration(tmp_path: Path) -> None:
-    (tmp_path / "peg.yaml").write_text("problem: peg_in_hole_2d\nsimulator: {seed: 4}\n")
-    assert hf.load_configuration(tmp_path / "peg.yaml").simulator.seed == 4
-
-
 @pytest.mark.parametrize(
     ("make_it", "message"),
     [
@@ -181,7 +172,3 @@ def test_a_wrong_argument_is_named(make_it: Callable[[], object], message: str) 
 
 def planner_of(*arguments: Any, **keywords: Any) -> hf.Planner:
     return hf.Planner(hf.make_problem("peg_in_hole_2d"), *arguments, **keywords)
-
-
-def test_the_method_is_chosen_by_name() -> None:
-    assert planner_of(particles=50, method="random").settings.selector.method == "random"

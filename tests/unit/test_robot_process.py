@@ -198,17 +198,6 @@ def test_it_decides_as_a_plain_loop_does(robots: Robots) -> None:
     assert robots.digests == plain_digests(robots.configuration)
 
 
-def test_it_runs_on_a_thread_that_is_not_the_main_one(robots: Robots) -> None:
-    def run() -> None:
-        robots.run()
-        vars(robots).pop("directory").close()
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    thread.join(PATIENCE_S)
-    assert robots.digests == plain_digests(robots.configuration)
-
-
 def test_what_comes_from_inside_an_effect_is_handled_after_the_effects_at_hand(
     robots: Robots,
 ) -> None:

@@ -45,13 +45,6 @@ def test_the_resolved_configuration_runs_again_to_the_same(workplace: Workplace)
     assert workplace.summary("second")["seed"] == 8
 
 
-def test_without_matplotlib_there_is_no_figure_but_all_else(workplace: Workplace) -> None:
-    said = workplace.runs("run", "peg.yaml", "--trials", "1", "--out", "out")
-    assert "pip install matplotlib" in said.stderr
-    assert not (workplace.directory / "out" / "trial.png").exists()
-    assert (workplace.directory / "out" / "summary.json").exists()
-
-
 def test_a_run_can_be_extended(workplace: Workplace) -> None:
     arguments = ("run", "peg.yaml", "--jobs", "1", "--out")
     workplace.runs(*arguments, "out", "--trials", "2")
@@ -426,11 +419,6 @@ def test_a_problem_whose_class_is_not_named(workplace: Workplace) -> None:
     )
     said = workplace.fails("run", "peg.yaml", "--out", "out", "--problem", "held_problem")
     assert "did you mean held_problem:Held?" in said
-
-
-def test_a_configuration_without_a_command(workplace: Workplace) -> None:
-    error = workplace.fails("peg.yaml", "--jobs", "2")
-    assert error.endswith("did you mean: holdfast run peg.yaml --jobs 2\n")
 
 
 class TestAfterAReboot:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import importlib
-import json
 import shutil
 import subprocess
 import sys
@@ -19,7 +18,6 @@ from holdfast import _kernel
 from holdfast.config import registry
 from holdfast.config.imports import follow_imports
 from holdfast.config.source_digest import core_version, problem_digest, problem_sources
-from holdfast.journal.fingerprint import difference
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = Path(holdfast.__file__).parent
@@ -270,35 +268,3 @@ class TestCore:
             for name in (*sources, "CMakeLists.txt")
         )
         assert _kernel.sources() == hashlib.sha256(lines.encode()).hexdigest(), "build it again"
-
-
-HERE = {
-    "holdfast_version": "1.0",
-    "holdfast_core": "1.0+a",
-    "problem_sources": json.dumps({"arm": "1", "arm_tables": "2"}),
-}
-
-
-class TestDifference:
-    def test_none(self) -> None:
-        assert difference(HERE, HERE) is None
-
-    def test_core(self) -> None:
-        there = {**HERE, "holdfast_core": "1.0+b"}
-        words = "it was made by holdfast 1.0+b, this is 1.0+a: other code"
-        assert difference(there, HERE) == (words, "1.0+b", False)
-
-    @pytest.mark.parametrize(
-        ("there", "changed"),
-        [({"arm": "1"}, "arm_tables"), ({"arm": "0", "arm_tables": "2"}, "arm")],
-    )
-    def test_sources(self, there: dict[str, str], changed: str) -> None:
-        differs = difference({**HERE, "problem_sources": json.dumps(there)}, HERE)
-        words = f"the problem's source has changed since (module {changed})"
-        assert differs == (words, "1.0+a", True)
-
-    def test_a_journal_of_before_the_core_was_told(self) -> None:
-        there = {"holdfast_version": "1.0", "problem_sources": json.dumps({"arm": "1"})}
-        assert difference(there, HERE) is None
-        there["problem_sources"] = json.dumps({"arm": "0"})
-        assert difference(there, HERE) is not None
