@@ -140,20 +140,6 @@ def test_threads_change_nothing(count: int, estimator: str) -> None:
     assert len(found) == 1
 
 
-@pytest.mark.parametrize("name", registry.names())
-def test_every_registered_problem_has_a_way(name: str) -> None:
-    """Where nothing is near, that is state plus action, one particle at a time or all at once."""
-    problem = registry.problem_class(name).from_settings({}, {})
-    belief = some_belief(problem, 50, "uniform")
-    settings = path((0, 3, 40))
-    points, factors = path_points(problem, settings, belief.states, 0)
-    assert points.shape == (3, 50, problem.action_size)
-    assert factors == (1.0, 1.0, 1.0)
-    for n in (0, 17, 49):
-        alone, _ = path_points(problem, settings, belief.states[n : n + 1], 0)
-        np.testing.assert_array_equal(alone[:, 0], points[:, n])
-
-
 @pytest.mark.parametrize("name", [*registry.names(), "busy_room"])
 def test_the_kernel_follows_as_numpy_does(name: str) -> None:
     """Bit for bit, through contacts and stages, for one way of several hundred steps."""

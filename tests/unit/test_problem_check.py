@@ -105,12 +105,6 @@ class ChangesItsArgument(Rover):
         return actions
 
 
-class ChangesStates(Rover):
-    def policy(self, states: Any, stage: Any) -> Any:
-        states -= 1.0
-        return -states
-
-
 class NotFinite(Rover):
     def move(self, states: Any, actions: Any, stream: Any) -> Any:
         moved = super().move(states, actions, stream)
@@ -304,7 +298,6 @@ WRONG = {
     "GridStart": (E, "streams", "initial_states draws coordinate 0 .* of a belief at random, but"),
     "Counts": (E, "purity", "policy returned something else"),
     "ChangesItsArgument": (E, "contract", "limit_action raised ValueError: .*read-only"),
-    "ChangesStates": (E, "contract", "policy raised ValueError: .*read-only"),
     "OneStateOnly": (E, "contract", r"policy of rover returned .* of shape \(2, 2\)"),
     "Branches": (E, "contract", "policy raised ValueError: The truth value"),
     "MeanOfTheBelief": (E, "contract", "policy of a belief is .* in another leading shape"),

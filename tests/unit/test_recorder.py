@@ -25,12 +25,6 @@ class TestRecorder:
         assert sum(record.rewards) == pytest.approx(record.result.reward)
         assert [sensing.before.step for sensing in record.sensing] == list(range(0, steps, 9))
 
-    def test_the_choice_has_the_least_entropy(self, tmp_path: Path) -> None:
-        for sensing in record_trial(configuration_of(tmp_path)).record.sensing:
-            entropies = sensing.sensing_info.entropies
-            assert entropies is not None
-            assert sensing.sensing_action == int(np.argmin(entropies))
-
     def test_it_keeps_copies(self, tmp_path: Path) -> None:
         record = record_trial(configuration_of(tmp_path)).record
         states = np.array(record.true_states)

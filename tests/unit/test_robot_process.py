@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from tests.recordings import robot_configuration
@@ -386,22 +385,6 @@ def test_what_its_own_planner_refuses_is_said_and_ends_the_run(
     with pytest.raises(ProblemError, match="policy gives nan"):
         robots.run()
     assert ("stopped", {"reason": "policy gives nan"}) in robots.events
-
-
-def test_a_problem_that_fails_is_named_with_the_step(
-    robots: Robots, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real = EnvironmentMaker.__call__
-
-    def make(*arguments: Any, **options: Any) -> Any:
-        environment = real(*arguments, **options)
-        monkeypatch.setattr(type(environment), "perform", lambda *_: "no reward")
-        return environment
-
-    monkeypatch.setattr(EnvironmentMaker, "__call__", make)
-    with pytest.raises(Exception, match="trial 0, step 0") as raised:
-        robots.run()
-    assert not isinstance(raised.value, TrialError)
 
 
 class TestSignals:

@@ -45,21 +45,10 @@ def test_the_resolved_configuration_runs_again_to_the_same(workplace: Workplace)
     assert workplace.summary("second")["seed"] == 8
 
 
-def test_a_run_can_be_extended(workplace: Workplace) -> None:
-    arguments = ("run", "peg.yaml", "--jobs", "1", "--out")
-    workplace.runs(*arguments, "out", "--trials", "2")
-    said = workplace.runs(*arguments, "out", "--trials", "5", "--resume")
-    assert "2 finished before" in said.stderr
-    workplace.runs(*arguments, "whole", "--trials", "5")
-    assert workplace.decided("out") == workplace.decided("whole")
-    out, whole = (workplace.directory / name / "config.yaml" for name in ("out", "whole"))
-    assert out.read_text() == whole.read_text()
-
-
 class TestResumeIfBegun:
     ARGUMENTS = ("run", "peg.yaml", "--jobs", "1", "--out", "out", "--resume-if-begun")
 
-    def test_it_begins_goes_on_and_has_ended(self, workplace: Workplace) -> None:
+    def test_it_begins_is_extended_and_has_ended(self, workplace: Workplace) -> None:
         (workplace.directory / "out").mkdir()  # as a volume is that was just mounted
         workplace.runs(*self.ARGUMENTS, "--trials", "2")
         said = workplace.runs(*self.ARGUMENTS, "--trials", "5")
@@ -72,6 +61,8 @@ class TestResumeIfBegun:
         assert {path: path.stat().st_mtime_ns for path in tables} == tables
         workplace.runs("run", "peg.yaml", "--jobs", "1", "--out", "whole", "--trials", "5")
         assert workplace.decided("out") == workplace.decided("whole")
+        whole = workplace.directory / "whole" / "config.yaml"
+        assert (out / "config.yaml").read_text() == whole.read_text()
 
     def test_tables_that_are_missing_or_old_are_made(self, workplace: Workplace) -> None:
         workplace.runs(*self.ARGUMENTS, "--trials", "2")
@@ -374,16 +365,6 @@ def test_credentials_that_are_not_there_claim_no_directory(
     arguments = ("peg.yaml", "--service", "tls/127.0.0.1:7", "--out", "out", *options)
     assert expected in workplace.fails("run", *arguments)
     assert workplace.names() == {"peg.yaml"}
-
-
-def test_a_service_in_the_file_that_cannot_be_one_is_named_with_its_key(
-    workplace: Workplace,
-) -> None:
-    services = "[tcp/127.0.0.1:7447, quic/10.0.0.7:7447]"
-    workplace.write("old.yaml", f"{PEG}\noffload: {{services: {services}}}\n")
-    error = workplace.fails("run", "old.yaml", "--out", "out")
-    assert "old.yaml: offload.services[1]: endpoint 'quic/10.0.0.7:7447'" in error
-    assert workplace.names() == {"peg.yaml", "old.yaml"}
 
 
 @pytest.mark.parametrize(

@@ -345,26 +345,6 @@ async def test_a_problem_that_raises_anything_costs_no_worker(error: BaseExcepti
         assert both.shell.statistics().refusals == {"failed": 5}
 
 
-@pytest.mark.parametrize("event", ["refused", "session_taken_over"])
-async def test_what_happens_often_is_logged_now_and_then_with_its_number(event: str) -> None:
-    """Whoever raises the epoch of its own session with each message must not fill a disk."""
-    async with joined() as both:
-        patient, robot = Patient(both.network), Robot()
-        for epoch in range(1, 101):
-            patient.send(b"rubbish" if event == "refused" else encode(robot.request(epoch=epoch)))
-        first = 1 if event == "refused" else 2
-        told: list[int] = []
-        while sum(1 + number for number in told) < 101 - first:
-            await asyncio.sleep(0.01)
-            told = [
-                int(str(fields.get("similar_lines_omitted", 0)))
-                for name, fields in both.log.events
-                if name == event
-            ]
-        assert sum(1 + number for number in told) == 101 - first
-        assert len(told) < 50
-
-
 async def test_close_does_not_wait_for_a_computation() -> None:
     async with joined(workers=1) as both:
         patient, call, _ = await both.robot_in_work(1)
