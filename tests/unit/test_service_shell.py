@@ -90,6 +90,32 @@ class Patient:
             robot.sense()
 
 
+class Call:
+    """A call that notes what it is told."""
+
+    on_gone: Callable[[], object] | None = None
+
+    def __init__(self, trace: list[str], robot: str = "a robot", payload: bytes = b"") -> None:
+        self.trace, self.robot, self.payload = trace, robot, payload
+        self.replies: list[bytes] = []
+        self.ended = asyncio.Event()
+
+    def reply(self, payload: bytes, *, last: bool = False) -> None:
+        self.replies.append(payload)
+        self.trace.append(f"{'last' if last else 'reply'} {payload.decode(errors='replace')}")
+        if last:
+            self.ended.set()
+
+    def end(self) -> None:
+        self.trace.append("end")
+        self.ended.set()
+
+    async def answer(self) -> Reply:
+        async with asyncio.timeout(PATIENCE_S):
+            await self.ended.wait()
+        return decode_reply(self.replies[-1])
+
+
 class Held(CapsuleRobot):
     """Stands still in its policy until it is let go."""
 
@@ -236,14 +262,9 @@ async def test_calls_are_heard_while_all_workers_compute() -> None:
             assert isinstance(replies[-1], SensingAnswer)
 
 
-@pytest.mark.parametrize(
-    ("bound", "value"),
-    [("_MAX_UNDECODED", 2), ("_MAX_UNDECODED_BYTES", int(2.5 * len(LARGE)))],
-)
-async def test_large_requests_beyond_the_bound_are_turned_away_unread(
-    bound: str, value: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(shell, bound, value)
+@pytest.fixture
+def let_go(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """Return what large requests wait for, to be decoded."""
     let_go = threading.Event()
 
     def decode(payload: bytes) -> Request:
@@ -252,6 +273,17 @@ async def test_large_requests_beyond_the_bound_are_turned_away_unread(
         return decode_request(payload)
 
     monkeypatch.setattr(shell, "decode_request", decode)
+    return let_go
+
+
+@pytest.mark.parametrize(
+    ("bound", "value"),
+    [("_MAX_UNDECODED", 2), ("_MAX_UNDECODED_BYTES", int(2.5 * len(LARGE)))],
+)
+async def test_large_requests_beyond_the_bound_are_turned_away_unread(
+    bound: str, value: int, let_go: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shell, bound, value)
     async with joined() as both:
         patient = Patient(both.network)
         kept = {patient.send(LARGE), patient.send(LARGE)}
@@ -275,45 +307,13 @@ async def test_large_requests_beyond_the_bound_are_turned_away_unread(
         assert both.log.events[0][0] == "busy"
 
 
-class LargeCall:
-    """A large request of a robot with a certificate."""
-
-    payload = LARGE
-    on_gone: Callable[[], object] | None = None
-
-    def __init__(self, robot: str) -> None:
-        self.robot = robot
-        self.replies: list[bytes] = []
-        self.ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-
-    def reply(self, payload: bytes, *, last: bool = False) -> None:
-        self.replies.append(payload)
-        if last:
-            self.end()
-
-    def end(self) -> None:
-        self.ended.set_result(None)
-
-    async def answer(self) -> Reply:
-        async with asyncio.timeout(PATIENCE_S):
-            await self.ended
-        return decode_reply(self.replies[-1])
-
-
 async def test_one_robot_takes_no_room_for_large_requests_from_another(
-    monkeypatch: pytest.MonkeyPatch,
+    let_go: threading.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shell, "_MAX_UNDECODED_BYTES", 2 * len(LARGE))
-    let_go = threading.Event()
-
-    def decode(payload: bytes) -> Request:
-        assert let_go.wait(PATIENCE_S)
-        return decode_request(payload)
-
-    monkeypatch.setattr(shell, "decode_request", decode)
     async with joined() as both:
         names = ["mallory"] * 3 + ["anna", "berta", "anna", "carla"]
-        calls = [LargeCall(name) for name in names]
+        calls = [Call([], name, LARGE) for name in names]
         for call in calls:
             both.shell.deliver(call)
         for index in (2, 5, 6):  # hers beyond the room, and all beyond twice the room
@@ -343,6 +343,26 @@ async def test_a_problem_that_raises_anything_costs_no_worker(error: BaseExcepti
             assert type(error).__name__ in reply.text
         await patient.run_turns(Robot(key=9), 1)
         assert both.shell.statistics().refusals == {"failed": 5}
+
+
+@pytest.mark.parametrize("event", ["refused", "session_taken_over"])
+async def test_what_happens_often_is_logged_now_and_then_with_its_number(event: str) -> None:
+    """Whoever raises the epoch of its own session with each message must not fill a disk."""
+    async with joined() as both:
+        patient, robot = Patient(both.network), Robot()
+        for epoch in range(1, 101):
+            patient.send(b"rubbish" if event == "refused" else encode(robot.request(epoch=epoch)))
+        first = 1 if event == "refused" else 2
+        told: list[int] = []
+        while sum(1 + number for number in told) < 101 - first:
+            await asyncio.sleep(0.01)
+            told = [
+                int(str(fields.get("similar_lines_omitted", 0)))
+                for name, fields in both.log.events
+                if name == event
+            ]
+        assert sum(1 + number for number in told) == 101 - first
+        assert len(told) < 50
 
 
 async def test_close_does_not_wait_for_a_computation() -> None:
@@ -424,23 +444,6 @@ class Scripted:
     def __init__(self, kind: str, run: Callable[[], object]) -> None:
         self.kind = kind
         self.run = run
-
-
-class Call:
-    """A call that notes what it is told."""
-
-    payload = b""
-    robot = "a robot"
-    on_gone: Callable[[], object] | None = None
-
-    def __init__(self, trace: list[str]) -> None:
-        self._trace = trace
-
-    def reply(self, payload: bytes, *, last: bool = False) -> None:
-        self._trace.append(f"{'last' if last else 'reply'} {payload.decode()}")
-
-    def end(self) -> None:
-        self._trace.append("end")
 
 
 def scripted(*jobs: tuple[str, float, Callable[[], object]]) -> tuple[Script, ServiceShell]:
