@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from tests.recordings import Journalling, configuration_of, record_trial
+from tests.recordings import Journalling, configuration_of, decided, record_trial
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import OutputError
@@ -18,11 +18,9 @@ from holdfast.journal.fingerprint import EarlierCode
 from holdfast.journal.run_directory import RunDirectory
 from holdfast.planning.inputs import ActingRecord, Record, Sensed
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.planner import Planner
 from holdfast.planning.settings import EnvironmentSettings
 from holdfast.robot import recomputing
 from holdfast.robot.recomputing import resume_run
-from holdfast.robot.trial import run_trial
 
 OLD = {"holdfast_version": "0.0.1", "holdfast_core": "0.0.1+abc"}
 
@@ -35,8 +33,7 @@ def result_of(configuration: Configuration, trial: int) -> TrialResult:
 
 def records_of(configuration: Configuration, trial: int, count: int) -> list[Record]:
     journalling = Journalling()
-    planner = Planner(configuration.problem, configuration.planning)
-    run_trial(planner, configuration.simulator.seed, trial, observer=journalling, max_steps=30)
+    decided(configuration, trial, observer=journalling)
     return journalling.records[:count]
 
 

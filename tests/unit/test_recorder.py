@@ -6,11 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.recordings import configuration_of, record_trial
+from tests.recordings import configuration_of, decided, record_trial
 
-from holdfast.planning.planner import Planner
 from holdfast.reports.recorder import MAX_PARTICLES_KEPT, Recorder
-from holdfast.robot.trial import run_trial
 
 
 class TestRecorder:
@@ -33,13 +31,7 @@ class TestRecorder:
     def test_it_looks_away_from_other_trials(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)
         recorder = Recorder(trial=0)
-        run_trial(
-            Planner(configuration.problem, configuration.planning),
-            configuration.simulator.seed,
-            1,
-            max_steps=configuration.simulator.max_steps,
-            observer=recorder,
-        )
+        decided(configuration, observer=recorder)
         assert recorder.record.result is None
         assert not recorder.record.actions
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.command_line import run_here
-from tests.recordings import forget_steps, rewrite
+from tests.recordings import decided, forget_steps, rewrite
 
 import holdfast as hf
 from holdfast.errors import OutputError
@@ -72,16 +72,9 @@ def test_the_arrays_are_what_was_run(recorded: Recorded, problem: str) -> None:
     run = recorded(CONFIGURATION.replace("peg_in_hole_2d", problem))
     configuration = run.configuration
     assert run.trials == (0, 1, 2)
-    planner = hf.Planner(configuration.problem, configuration.planning)
     for number, trial in enumerate(run.read()):
         seen = Seen()
-        result = hf.run_trial(
-            planner,
-            configuration.simulator.seed,
-            number,
-            max_steps=configuration.simulator.max_steps,
-            observer=seen,
-        )
+        result = decided(configuration, number, observer=seen)
         assert trial.result is not None
         assert trial.result.digest == result.digest == run.results["digest"][number]
         assert run.results["steps"][number] == result.steps == len(trial.task_actions)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from tests.recordings import robot_configuration
+from tests.recordings import decided, robot_configuration
 from tests.unit.test_runtime_events import RecordingSink
 
 from holdfast.config.loader import Configuration
@@ -41,7 +41,6 @@ from holdfast.robot import process as robot_process
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 from holdfast.robot.links import Links, make_links
 from holdfast.robot.process import RobotProcess
-from holdfast.robot.trial import run_trial
 from holdfast.runtime.events import BoundedEventLog
 
 PATIENCE_S = 30.0
@@ -109,13 +108,7 @@ def robots(configuration: Configuration, tmp_path: Path) -> Iterator[Robots]:
 def plain_digests(configuration: Configuration) -> list[str]:
     """Return what a loop without journal, wire and service decides."""
     return [
-        run_trial(
-            Planner(configuration.problem, configuration.planning),
-            configuration.simulator.seed,
-            trial,
-            max_steps=configuration.simulator.max_steps,
-        ).digest
-        for trial in range(configuration.simulator.num_trials)
+        decided(configuration, trial).digest for trial in range(configuration.simulator.num_trials)
     ]
 
 

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.recordings import decided
 
 from holdfast.config.loader import load
 from holdfast.config.user_code import find_class
 from holdfast.errors import ConfigurationError
-from holdfast.planning.planner import Planner
-from holdfast.robot.trial import run_trial
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "docking.py"
@@ -47,12 +46,9 @@ def outcomes(name: str, trials: int) -> list[str]:
         search_directory=EXAMPLE.parent,
         error_type=ConfigurationError,
     )
-    planner = Planner(configuration.problem, configuration.planning)
     seed = configuration.simulator.seed
-    steps = configuration.simulator.max_steps
     results = [
-        run_trial(planner, seed, trial, max_steps=steps, environment=robot(seed, trial))
-        for trial in range(trials)
+        decided(configuration, trial, environment=robot(seed, trial)) for trial in range(trials)
     ]
     assert all(result.failed == bool(result.reason) for result in results)
     return [result.outcome for result in results]

@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.recordings import decided
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import InvalidValueError, TransportError
 from holdfast.planning.inputs import ActingRecord, Sensed, decode_floats
-from holdfast.planning.planner import Planner
 from holdfast.protocol.status import Status
 from holdfast.robot.environment import Environment, SimulatedEnvironment
-from holdfast.robot.trial import run_trial
 from holdfast_ros.active_sensing import (
     ActiveSensing,
     DecisionAnswer,
@@ -91,12 +90,7 @@ def decisions(
 
 
 def in_process(configuration: Configuration, trial: int) -> list[int | tuple[float, ...]]:
-    result = run_trial(
-        Planner(configuration.problem, configuration.planning),
-        configuration.simulator.seed,
-        trial,
-        max_steps=configuration.simulator.max_steps,
-    )
+    result = decided(configuration, trial)
     made: list[int | tuple[float, ...]] = []
     assert result.decisions is not None
     for decision in result.decisions:

@@ -10,35 +10,26 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.command_line import run_here
+from tests.recordings import decided
 
 from holdfast.config.loader import Configuration, load
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, OnLost
 from holdfast.robot.environment_maker import load_environment
-from holdfast.robot.trial import run_trial
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TRIALS = 10
 
 
 def example(name: str, **overrides: Any) -> Configuration:
-    return load(EXAMPLES / f"{name}.yaml", overrides=overrides)
+    return load(EXAMPLES / f"{name}.yaml", overrides={"simulator.seed": 1, **overrides})
 
 
 def results_of(configuration: Configuration, on_lost: OnLost) -> list[TrialResult]:
-    planner = Planner(configuration.problem, configuration.planning)
     make = load_environment(configuration)
+    lost = LostSettings(on_lost=on_lost)
     return [
-        run_trial(
-            planner,
-            1,
-            trial,
-            max_steps=configuration.simulator.max_steps,
-            environment=make(trial),
-            lost=LostSettings(on_lost=on_lost),
-        )
-        for trial in range(TRIALS)
+        decided(configuration, trial, environment=make(trial), lost=lost) for trial in range(TRIALS)
     ]
 
 
