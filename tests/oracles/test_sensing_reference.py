@@ -459,40 +459,6 @@ def test_general_likelihood_with_the_same_draws(
         assert index == expected_index
 
 
-def test_stratified_particles() -> None:
-    """Sample i is drawn from the i-th part of the cumulated weight, and all samples follow it.
-
-    Over 500 choices, a chi-square test of the numbers of draws at 1e-6; strata only make it milder.
-    """
-    choices, samples = 500, 4
-    problem, settings = Plane(), settings_of(samples=samples)
-    belief = some_belief(problem, 20, "weighted")
-    upper = np.cumsum(belief.weights)
-    lower = upper - belief.weights
-    seen: list[int] = []
-
-    class Watched(General):
-        def sample_observation(
-            self, state: FloatArray, sensing_action: int, stream: Stream
-        ) -> FloatArray:
-            seen.append(int((belief.states == state).all(axis=1).argmax()))
-            return super().sample_observation(state, sensing_action, stream)
-
-    drawn = np.zeros(20)
-    for choice in range(choices):
-        hypotheses = stream(35, 0, choice, Purpose.HYPOTHESES)
-        watched: Problem = Watched(problem, hypotheses, samples)  # type: ignore[assignment]
-        seen.clear()
-        choose_sensing_action(watched, settings, belief, 0, hypotheses, hypotheses)
-        # The same particles for every sensing action.
-        assert seen == seen[:samples] * 3
-        for i, particle in enumerate(seen[:samples]):
-            assert lower[particle] < (i + 1) / samples
-            assert upper[particle] > i / samples
-            drawn[particle] += 1
-    assert stats.chisquare(drawn, choices * samples * belief.weights).pvalue > 1e-6
-
-
 @pytest.mark.parametrize("kind", ["equal", "spread", "extreme", "zeros", "short", "one"])
 @pytest.mark.parametrize("samples", [1, 10, 97])
 def test_both_paths_imagine_from_the_same_particles(kind: str, samples: int) -> None:

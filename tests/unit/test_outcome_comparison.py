@@ -11,11 +11,12 @@ import msgspec
 import numpy as np
 import pytest
 from scipy import stats
+from tests import recordings
 
 from holdfast.errors import OutputError
 from holdfast.journal.journal import Journal
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning.outcome import DecisionLog, TrialResult
+from holdfast.planning.outcome import TrialResult
 from holdfast.reports import outcome_comparison
 from holdfast.reports.outcome_comparison import OutcomeEffect, compare_outcomes, effects_of
 
@@ -28,31 +29,9 @@ simulator: {{num_trials: {trials}, seed: {seed}, max_steps: {limit}}}
 """
 
 
-def result_of(
-    trial: int,
-    steps: int,
-    *,
-    success: bool = True,
-    reward: float | None = None,
-    sensing_ms: Sequence[float] = (),
-) -> TrialResult:
-    log = DecisionLog(2)
-    log.ended(steps, bytes(32))
-    decisions = log.decisions()
-    return TrialResult(
-        trial=trial,
-        seed=5,
-        success=success,
-        steps=steps,
-        reward=reward,
-        sensing_decisions=len(sensing_ms),
-        mean_sensing_ms=0.0,
-        recoveries=0,
-        unexplained_observations=0,
-        digest=decisions.digest(),
-        sensing_ms=tuple(sensing_ms),
-        decisions=decisions,
-    )
+def result_of(trial: int, steps: int, *, reward: float | None = None, **more: Any) -> TrialResult:
+    made = recordings.result_of(trial, **more)
+    return msgspec.structs.replace(made, steps=steps, reward=reward)
 
 
 def run_of(

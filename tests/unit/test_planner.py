@@ -13,7 +13,7 @@ from tests.planning_settings import SEED, STEPS, TRIAL, planning_settings
 
 from holdfast.config import registry
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.randomness import Stream
 from holdfast.planning import planner as planning
 from holdfast.planning.belief import Belief
@@ -234,23 +234,6 @@ class TestFunctions:
         assert info.estimate.tolist() == state.belief.states[0].tolist()
 
 
-class Broken(PegInHole2D):
-    """A peg whose functions return what they are told to."""
-
-    def __init__(self, **returned: FloatArray) -> None:
-        super().__init__()
-        self.returned = returned
-
-    def initial_states(self, stream: Stream, count: int) -> FloatArray:
-        return self.returned.get("initial_states", super().initial_states(stream, count))
-
-    def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
-        return self.returned.get("move", super().move(states, actions, stream))
-
-    def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
-        return self.returned.get("policy", super().policy(states, stage))
-
-
 class TestBadInput:
     @pytest.mark.parametrize("count", [0, -3, 10_000_001])
     def test_number_of_particles(self, peg: Problem, count: int) -> None:
@@ -325,26 +308,22 @@ class TestBadInput:
             planner.advance(state, action)  # type: ignore[arg-type]
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf])
-    @pytest.mark.parametrize("function", ["initial_states", "move"])
-    def test_states_not_finite(self, peg: Problem, function: str, bad: float) -> None:
-        configured = planning_settings()
-        state = Planner(peg, configured).init(SEED, TRIAL)
+    @pytest.mark.parametrize("function", ["initial_states", "move", "policy"])
+    def test_what_a_problem_returns_is_finite(self, function: str, bad: float) -> None:
+        planner = Planner(PegInHole2D(), planning_settings())
+        state = planner.init(SEED, TRIAL)
         states = state.belief.states.copy()
         states[7, 1] = bad
-        broken = Broken(**{function: states})
-        planner = Planner(broken, configured)
-        with pytest.raises(ProblemError, match=rf"{function} of peg_in_hole_2d put particle 7 at"):
-            if function == "move":
-                planner.advance(state, np.zeros(3))
-            else:
-                planner.init(SEED, TRIAL)
-
-    @pytest.mark.parametrize("bad", [np.nan, np.inf])
-    def test_policy_not_finite(self, peg: Problem, bad: float) -> None:
-        state = Planner(peg, planning_settings()).init(SEED, TRIAL)
-        broken = Broken(policy=np.array([0.0, np.nan, bad]))
-        with pytest.raises(ProblemError, match="policy of peg_in_hole_2d gives"):
-            Planner(broken, planning_settings()).choose_task_action(state)
+        returned = np.array([0.0, np.nan, bad]) if function == "policy" else states
+        setattr(planner.problem, function, lambda *_: returned)
+        calls: dict[str, Callable[[], object]] = {
+            "initial_states": lambda: planner.init(SEED, TRIAL),
+            "move": lambda: planner.advance(state, np.zeros(3)),
+            "policy": lambda: planner.choose_task_action(state),
+        }
+        says = "gives" if function == "policy" else "put particle 7 at"
+        with pytest.raises(ProblemError, match=f"{function} of peg_in_hole_2d {says}"):
+            calls[function]()
 
     def test_the_last_step_of_all(self, peg: Problem) -> None:
         """Steps are words of 32 bits; the stream of the one after the last is refused."""

@@ -11,7 +11,7 @@ from msgspec import structs
 from tests.command_line import Workplace
 
 from holdfast.cli import _print_defect
-from holdfast.cli.terminal import print_summary, progress_line
+from holdfast.cli.terminal import print_summary
 from holdfast.journal.tables import SummaryBuilder
 from holdfast.printable import brief, cell, one_line, printable
 from holdfast.protocol.messages import Refused, decode_reply, encode
@@ -161,11 +161,6 @@ def test_a_defect_s_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     error = ValueError(HOSTILE)
     _print_defect(type(error), error, None)
     assert capsys.readouterr().err == f"ValueError: {SEEN}\n"
-
-
-def test_progress(capsys: pytest.CaptureFixture[str]) -> None:
-    progress_line(3, quiet=False).say(HOSTILE)
-    assert capsys.readouterr().err == f"{SEEN}\n"
 
 
 def test_a_summary_is_no_markup(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.programs import said_by
 from tests.unit.test_protocol_service import CODE, planning_of
 
 from holdfast.config import registry
@@ -145,7 +145,4 @@ for thread in threads:
     thread.join()
 assert len(built) == 16
 """
-        done = subprocess.run(
-            [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
-        )
-        assert done.returncode == 0, done.stderr
+        said_by(program)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import importlib.metadata
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from tests.programs import said_by
 
 import holdfast as hf
 from holdfast.errors import InvalidValueError, ProblemError, UnknownProblemError
@@ -56,14 +56,9 @@ def test_importing_it_imports_nothing_else() -> None:
         "import sys; before = set(sys.modules); import holdfast; "
         "print(sorted(name for name in set(sys.modules) - before if '.' in name or 'num' in name))"
     )
-    found = subprocess.run(
-        [sys.executable, "-S", "-c", f"import sys; sys.path[:] = {sys.path!r}; {program}"],
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    assert "holdfast." not in found.stdout
-    assert "numpy" not in found.stdout
+    found = said_by(f"import sys; sys.path[:] = {sys.path!r}; {program}", flags=["-S"])
+    assert "holdfast." not in found
+    assert "numpy" not in found
 
 
 def test_it_is_typed() -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from tests import recordings
 from tests.command_line import Workplace
 
 from holdfast.errors import HoldfastError, OutputError
@@ -55,18 +56,13 @@ def result_of(
         log.acted(step, np.array(action))
     log.ended(len(steps), last)
     decisions = log.decisions()
-    return TrialResult(
-        trial=trial,
-        seed=5,
-        success=True,
+    return msgspec.structs.replace(
+        recordings.result_of(trial, reward=reward),
         steps=len(steps),
-        reward=reward,
-        sensing_decisions=sum(step[0] is not None for step in steps),
         mean_sensing_ms=float(trial),
         recoveries=trial,
-        unexplained_observations=0,
+        sensing_decisions=sum(step[0] is not None for step in steps),
         digest=decisions.digest(),
-        sensing_ms=(),
         decisions=decisions,
     )
 

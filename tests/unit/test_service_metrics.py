@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import msgspec
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from tests.programs import said_by
 
 from holdfast import __version__
 from holdfast.protocol.messages import PROTOCOL_VERSION
@@ -150,16 +151,10 @@ def test_without_the_package_the_error_says_how_to_get_it() -> None:
         "try:\n    require_prometheus()\n"
         "except MetricsError as error:\n    print(error)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert "pip install prometheus-client" in done.stdout
+    assert "pip install prometheus-client" in said_by(program)
 
 
 def test_the_package_is_not_imported_before_it_is_used() -> None:
     modules = "sys, holdfast.service.metrics, holdfast.robot.metrics"
     program = f"import {modules}; print('prometheus_client' in sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "False\n"
+    assert said_by(program) == "False\n"

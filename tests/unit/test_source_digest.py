@@ -6,12 +6,12 @@ import argparse
 import hashlib
 import importlib
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.programs import said_by
 
 import holdfast
 from holdfast import _kernel
@@ -104,12 +104,7 @@ class TestProblem:
             "print(problem_digest(registry.problem_class('arm_problem:Arm', Path(sys.argv[1]))))"
         )
         found = {
-            subprocess.run(
-                [sys.executable, *flags, "-c", program, str(place)],
-                check=True,
-                capture_output=True,
-                text=True,
-            ).stdout
+            said_by(program, str(place), flags=flags)
             for place, flags in (
                 (folder, ()),
                 (tmp_path / "elsewhere", ("-O",)),
@@ -249,10 +244,7 @@ class TestCore:
             "import holdfast, holdfast.config.source_digest as source_digest\n"
             "print(holdfast.__file__); print(source_digest.core_version())"
         )
-        done = subprocess.run(
-            [sys.executable, "-c", program], check=True, capture_output=True, text=True
-        )
-        file_name, version = done.stdout.split()
+        file_name, version = said_by(program).split()
         assert file_name == str(tmp_path / "holdfast" / "__init__.py")
         assert (version == core_version()) == (changed is None)
 
