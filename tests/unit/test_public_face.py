@@ -128,16 +128,7 @@ def test_the_loop_and_run_trial_decide_the_same() -> None:
             lambda: hf.Planner(cast("Any", "peg_in_hole_2d")),
             r"problem is the name 'peg_in_hole_2d'",
         ),
-        (lambda: planner_of(particles=0), r"particle_filter\.num_particles"),
-        (lambda: planner_of(particles="300"), r"particle_filter\.num_particles"),
         (lambda: planner_of(method="rnd"), r"selector\.method is \"rnd\"; expected one of"),
-        (
-            lambda: planner_of(
-                hf.PlanningSettings(selector=cast("Any", {"method": "random"}))
-            ).init(0),
-            r"selector is of type dict; it must be a SelectorSettings",
-        ),
-        (lambda: hf.run_trial(planner_of(), max_steps=0), r"max_steps 0: allowed are"),
         (
             lambda: hf.PlanningSettings(sensing_intervals=8),  # type: ignore[call-arg]
             r"PlanningSettings has no sensing_intervals; did you mean sensing_interval\?; allowed",

@@ -36,7 +36,6 @@ import sys
 
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
-
 class InThePolicy(PegInHole2D):
     actions = 0
 
@@ -47,38 +46,31 @@ class InThePolicy(PegInHole2D):
                 sys.exit(0)
         return super().limit_action(actions)
 
-
 class InTheWorld(PegInHole2D):
     def move(self, states, actions, stream):
         if states.ndim == 1:
             sys.exit(0)
         return super().move(states, actions, stream)
 
-
 class InTheConstructor(PegInHole2D):
     def __init__(self, *settings):
         sys.exit(0)
-
 
 class WithoutException(PegInHole2D):
     def policy(self, states, stage):
         raise GeneratorExit("enough")
 
-
 class Wordless(Exception):
     def __str__(self):
         sys.exit(0)
-
 
 class WithoutWords(PegInHole2D):
     def policy(self, states, stage):
         raise Wordless
 
-
 class WithManyWords(PegInHole2D):
     def policy(self, states, stage):
         raise ValueError("many\\n" * 100_000)
-
 
 class Recursive(PegInHole2D):
     def policy(self, states, stage):
@@ -87,15 +79,12 @@ class Recursive(PegInHole2D):
     def turn(self, states, stage):
         return self.policy(states, stage)
 
-
 class WithoutSetter(PegInHole2D):
     resolution = property(lambda self: 1.0)
-
 
 class RobotThatExits:
     def __init__(self):
         sys.exit(0)
-
 
 class SensorThatExits:
     def perform_sensing(self, sensing_action):
