@@ -94,6 +94,15 @@ def failed(result: TrialResult) -> TrialResult:
     return msgspec.structs.replace(result, success=False, failed=True)
 
 
+def flipped(result: TrialResult, byte: int = 9) -> TrialResult:
+    """Return the result with another decision; the byte is of the first sensing action."""
+    assert result.decisions is not None
+    log = bytearray(result.decisions.log)
+    log[byte] ^= 1
+    decisions = msgspec.structs.replace(result.decisions, log=bytes(log))
+    return msgspec.structs.replace(result, decisions=decisions, digest=decisions.digest())
+
+
 def without_decisions(result: TrialResult) -> TrialResult:
     """Return the result as the journal returns it."""
     return msgspec.structs.replace(result, decisions=None)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 from tests.line_problem import Line
-from tests.planning_settings import SEED, STEPS, TRIAL, planning_settings
+from tests.planning_settings import SEED, TRIAL, planning_settings
 
 from holdfast.config import registry
 from holdfast.errors import InvalidValueError, ProblemError
@@ -19,7 +19,6 @@ from holdfast.planning import planner as planning
 from holdfast.planning.belief import Belief
 from holdfast.planning.planner import (
     Planner,
-    PlanningState,
     decode_checkpoint,
     digest,
     encode_checkpoint,
@@ -32,7 +31,6 @@ from holdfast.planning.settings import (
 )
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
-from holdfast.robot.environment import SimulatedEnvironment
 
 
 @pytest.fixture(scope="module", params=registry.names())
@@ -47,107 +45,33 @@ def peg() -> Problem:
     return PegInHole2D()
 
 
-class Decision(NamedTuple):
-    """The state before a call, and what the call was given from outside and returned."""
+def test_static_parameters_are_drawn_anew() -> None:
+    """And the same again, from a checkpoint: so says every service."""
 
-    state: PlanningState
-    kind: str
-    outside: bytes
-    returned: bytes
+    class Landmark(Line):
+        def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+            moved = states + actions + 0.1 * stream.normal(states.shape)
+            moved[..., 1] = states[..., 1]
+            return moved
 
+    class Named(Landmark):
+        static_parameters = (1,)
 
-def go_on(
-    problem: Problem,
-    configured: PlanningSettings,
-    state: PlanningState,
-    observations: dict[int, FloatArray],
-    until: int,
-) -> Iterator[Decision]:
-    """Yield decisions from a state on; what the world shows is given by step."""
-    planner = Planner(problem, configured)
-    while state.step < until:
-        if planner.needs_sensing(state):
-            index, info = planner.choose_sensing_action(state)
-            assert info.samples is not None
-            yield Decision(state, "sense", b"", bytes([index]) + info.samples.tobytes())
-            observation = observations[state.step]
-            before = state
-            state, _ = planner.observe(state, index, observation)
-            yield Decision(before, "observe", observation.tobytes(), digest(state))
-        action, task_info = planner.choose_task_action(state)
-        told = action.tobytes() + task_info.estimate.tobytes() + task_info.commanded.tobytes()
-        yield Decision(state, "act", b"", told + bytes([task_info.stage]))
-        before = state
-        state = planner.advance(state, action)
-        yield Decision(before, "advance", action.tobytes(), digest(state))
-
-
-def observations_of(problem: Problem, configured: PlanningSettings) -> dict[int, FloatArray]:
-    """Return what a simulated world shows at each sensing step."""
-    environment = SimulatedEnvironment(problem, SEED, TRIAL)
-    planner = Planner(problem, configured)
-    state = planner.init(SEED, TRIAL)
-    observations = {}
-    while state.step < STEPS:
-        if planner.needs_sensing(state):
-            index, _ = planner.choose_sensing_action(state)
-            observations[state.step] = environment.perform_sensing(index)
-            state, _ = planner.observe(state, index, observations[state.step])
-        action, _ = planner.choose_task_action(state)
-        environment.perform(action)
-        state = planner.advance(state, action)
-    return observations
-
-
-class TestReplay:
-    @pytest.mark.parametrize("resampling_threshold", [1.0, 0.4])
-    def test_from_every_point_the_rest_is_the_same(
-        self, problem: Problem, resampling_threshold: float
-    ) -> None:
-        """After a crash at any point: read the checkpoint, see what was seen, decide the same."""
-        configured = planning_settings(resampling_threshold=resampling_threshold)
-        observations = observations_of(problem, configured)
-        start = Planner(problem, configured).init(SEED, TRIAL)
-        whole = list(go_on(problem, configured, start, observations, STEPS))
-        assert {decision.kind for decision in whole} == {"sense", "observe", "act", "advance"}
-        # With fewer resamplings, every other point.
-        for at in range(0, len(whole), 1 if resampling_threshold == 1.0 else 2):
-            state = whole[at].state
-            # The state in which a step senses, or acts: only there does the loop begin.
-            if whole[at].kind in {"observe", "advance"}:
-                continue
-            resumed = decode_checkpoint(encode_checkpoint(state))
-            fresh = type(problem).from_settings({}, {})  # type: ignore[attr-defined]
-            rest = list(go_on(fresh, configured, resumed, observations, STEPS))
-            assert [again[1:] for again in rest] == [first[1:] for first in whole[at:]]
-
-    def test_static_parameters_are_drawn_anew(self) -> None:
-        """And the same again, from a checkpoint: so says every service."""
-
-        class Landmark(Line):
-            def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
-                moved = states + actions + 0.1 * stream.normal(states.shape)
-                moved[..., 1] = states[..., 1]
-                return moved
-
-        class Named(Landmark):
-            static_parameters = (1,)
-
-        distinct, ends = [], []
-        for problem, at in ((Landmark(), 30), (Named(), 30), (Named(), 4)):
-            planner = Planner(problem, planning_settings())
-            state = planner.init(SEED, TRIAL)
-            for step in range(10):
-                if step == at:
-                    state = decode_checkpoint(encode_checkpoint(state))
-                state, _ = planner.observe(state, 1, np.array([0.5]))
-                state = planner.advance(state, np.array([0.1]))
-            values = state.belief.states[:, 1]
-            distinct.append((len(np.unique(values)), len(values)))
-            ends.append(planner.digest(state))
-        assert distinct[0][0] < 0.2 * distinct[0][1]
-        assert distinct[1][0] == distinct[1][1]
-        assert ends[0] != ends[1] == ends[2]
+    distinct, ends = [], []
+    for problem, at in ((Landmark(), 30), (Named(), 30), (Named(), 4)):
+        planner = Planner(problem, planning_settings())
+        state = planner.init(SEED, TRIAL)
+        for step in range(10):
+            if step == at:
+                state = decode_checkpoint(encode_checkpoint(state))
+            state, _ = planner.observe(state, 1, np.array([0.5]))
+            state = planner.advance(state, np.array([0.1]))
+        values = state.belief.states[:, 1]
+        distinct.append((len(np.unique(values)), len(values)))
+        ends.append(planner.digest(state))
+    assert distinct[0][0] < 0.2 * distinct[0][1]
+    assert distinct[1][0] == distinct[1][1]
+    assert ends[0] != ends[1] == ends[2]
 
 
 class TestPurity:

@@ -36,7 +36,6 @@ from holdfast.protocol.robot_events import (
     CallEnded,
     ReplyReceived,
     ServiceAppeared,
-    ServiceVanished,
     TransportEvent,
 )
 from holdfast.protocol.service import Service
@@ -363,39 +362,6 @@ async def test_what_happens_often_is_logged_now_and_then_with_its_number(event: 
             ]
         assert sum(1 + number for number in told) == 101 - first
         assert len(told) < 50
-
-
-async def test_close_does_not_wait_for_a_computation() -> None:
-    async with joined(workers=1) as both:
-        patient, call, _ = await both.robot_in_work(1)
-        both.shell.stop("enough")
-        assert await both.shell.wait() == "enough"
-        await both.shell.close()
-        assert both.shell.is_computing  # until the test lets it go
-        events: list[TransportEvent] = []
-        while CallEnded(call) not in events:
-            events.append(await patient.events.get())
-        assert ServiceVanished("service", "boot") in events
-
-
-async def test_a_service_that_drains_answers_whoever_is_still_there() -> None:
-    async with joined(workers=1) as both:
-        patient, call, _ = await both.robot_in_work(1)
-        drained = asyncio.create_task(both.shell.drain(PATIENCE_S))
-        await asyncio.sleep(0)
-        assert both.shell.is_draining
-        assert not drained.done()
-        both.held.let_go.set()
-        await drained
-        replies = (await patient.collect({call}))[call]
-        assert isinstance(replies[-1], SensingAnswer)
-
-
-async def test_draining_ends_at_its_bound() -> None:
-    async with joined(workers=1) as both:
-        await both.robot_in_work(1)
-        await both.shell.drain(0.01)
-        assert both.shell.is_computing
 
 
 # -- a machine that is scripted ------------------------------------------------------------------
