@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.command_line import run_here
+from tests.command_line import Workplace
 from tests.recordings import decided, forget_steps, rewrite
 
 import holdfast as hf
@@ -56,13 +56,14 @@ class Seen(TrialObserver):
 
 
 @pytest.fixture
-def recorded(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Recorded:
+def recorded(workplace: Workplace) -> Recorded:
     def run(text: str = CONFIGURATION) -> RunArrays:
-        (tmp_path / "run.yaml").write_text(text)
+        workplace.write("run.yaml", text)
         module = "from holdfast_lab.simulation.peg_with_encoders import PegWithEncoders\n"
-        (tmp_path / "encoders.py").write_text(module)
-        assert run_here(capsys, tmp_path, "run", "run.yaml", "--out", "run", "-q").code in (0, 1)
-        return hf.open_run(tmp_path / "run", problem_directory=tmp_path)
+        workplace.write("encoders.py", module)
+        assert workplace.run("run", "run.yaml", "--out", "run", "-q").code in (0, 1)
+        directory = workplace.directory
+        return hf.open_run(directory / "run", problem_directory=directory)
 
     return run
 

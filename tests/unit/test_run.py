@@ -234,7 +234,6 @@ def test_a_figure_that_a_problem_fails_to_describe(
     assert workplace.summary("out")["finished"] == 6
 
 
-@pytest.mark.parametrize("error", [KeyError("a")])
 @pytest.mark.parametrize(
     ("function", "says"),
     [
@@ -244,14 +243,10 @@ def test_a_figure_that_a_problem_fails_to_describe(
     ],
 )
 def test_what_a_finished_run_can_do_without_may_fail(
-    workplace: Workplace,
-    monkeypatch: pytest.MonkeyPatch,
-    function: str,
-    says: str,
-    error: BaseException,
+    workplace: Workplace, monkeypatch: pytest.MonkeyPatch, function: str, says: str
 ) -> None:
     def fail(*_: object) -> None:
-        raise error
+        raise KeyError("a")
 
     monkeypatch.setattr(function, fail)
     said = workplace.runs("run", "peg.yaml", "--out", "out", "--trials", "1", figures=True)
@@ -279,7 +274,7 @@ def test_a_problem_is_no_file(workplace: Workplace) -> None:
 def test_what_is_nearly_a_file_is_suggested(workplace: Workplace) -> None:
     assert workplace.fails("run", "pegg.yaml").endswith("no such file; did you mean peg.yaml?\n")
     assert "'problem: lamps:Room' is enough" in workplace.fails("run", "lamps:Room")
-    (workplace.directory / "lamps.py").write_text("")
+    workplace.write("lamps.py", "")
     error = workplace.fails("run", "lamps.py")
     assert "lamps.py: is Python; lamps:CLASS is a problem, and a run needs" in error
 
@@ -302,13 +297,8 @@ class Licensed(PegInHole2D):
 def test_a_constructor_that_fails_in_what_is_resumed_ends_with_the_command(
     command: list[str], workplace: Workplace
 ) -> None:
-    (workplace.directory / "licensed.py").write_text(LICENSED)
-    text = (
-        (workplace.directory / "peg.yaml")
-        .read_text()
-        .replace("peg_in_hole_2d", "licensed:Licensed")
-    )
-    (workplace.directory / "own.yaml").write_text(text)
+    workplace.write("licensed.py", LICENSED)
+    workplace.write("own.yaml", PEG.replace("peg_in_hole_2d", "licensed:Licensed"))
     licence = workplace.directory / "licence"
     name, *options = command
     words = [name, "own.yaml", *options, "--out", "out"]
@@ -334,37 +324,27 @@ def test_too_few_particles_are_noted(workplace: Workplace) -> None:
     assert "take more particles (particle_filter.num_particles)" in " ".join(said.stdout.split())
 
 
+MY_ROBOT = ("--environment", "my_robot:MyRobot")
+
+
 @pytest.mark.parametrize(
-    ("name", "text", "expected"),
+    ("options", "text", "expected"),
     [
-        ("my_robot:Robot", "class MyRobot: pass\n", "did you mean MyRobot?"),
-        ("my_robt:MyRobot", "class MyRobot: pass\n", "No module named 'my_robt'"),
-        ("my_robot:MyRobot", "import math\nmath.sqrt(-1)\n", 'my_robot.py", line 2'),
-        ("my_robot:MyRobot", "import sys\nsys.exit(0)\n", "raised SystemExit: 0"),
+        (("-e", "my_robot:Robot"), "class MyRobot: pass\n", "did you mean MyRobot?"),
+        (("-e", "my_robt:MyRobot"), "class MyRobot: pass\n", "No module named 'my_robt'"),
+        (MY_ROBOT, "import math\nmath.sqrt(-1)\n", 'my_robot.py", line 2'),
+        (MY_ROBOT, "import sys\nsys.exit(0)\n", "raised SystemExit: 0"),
+        (("--service", "tls/a:7", "--tls", "nowhere"), "", "nowhere/authority.pem: cannot be read"),
+        (("--service", "tls/127.0.0.1:7"), "", "tls needs credentials"),
     ],
 )
 @pytest.mark.parametrize("out", [("--out", "out"), ()])
-def test_an_environment_that_is_not_there_claims_no_directory(
-    workplace: Workplace, name: str, text: str, expected: str, out: tuple[str, ...]
+def test_what_is_not_there_claims_no_directory(
+    workplace: Workplace, options: tuple[str, ...], text: str, expected: str, out: tuple[str, ...]
 ) -> None:
     workplace.write("my_robot.py", text)
-    assert expected in workplace.fails("run", "peg.yaml", "--environment", name, *out)
+    assert expected in workplace.fails("run", "peg.yaml", *options, *out)
     assert workplace.names() == {"peg.yaml", "my_robot.py"}
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (("--tls", "nowhere"), "nowhere/authority.pem: cannot be read"),
-        ((), "tls needs credentials"),
-    ],
-)
-def test_credentials_that_are_not_there_claim_no_directory(
-    workplace: Workplace, options: tuple[str, ...], expected: str
-) -> None:
-    arguments = ("peg.yaml", "--service", "tls/127.0.0.1:7", "--out", "out", *options)
-    assert expected in workplace.fails("run", *arguments)
-    assert workplace.names() == {"peg.yaml"}
 
 
 @pytest.mark.parametrize(
