@@ -56,6 +56,15 @@ def run_here(
     return Said(code, said.out, said.err)
 
 
+PEG = """
+problem: peg_in_hole_2d
+particle_filter: {num_particles: 40}
+active_sensing: {num_observation_samples: 3, num_cores: 1}
+simulator: {num_trials: 6, max_steps: 80, seed: 3}
+"""
+"""A small run."""
+
+
 class Workplace:
     """A directory in which commands are run."""
 

@@ -13,20 +13,13 @@ from typing import Any
 
 import msgspec
 import pytest
-from tests.command_line import Workplace
+from tests.command_line import PEG, Workplace
 from tests.recordings import forget_steps, rewrite
 
 from holdfast.errors import HeldError
 from holdfast.journal import journal_file
 from holdfast.journal.journal_file import Notes
 from holdfast.robot.process import RobotProcess
-
-PEG = """
-problem: peg_in_hole_2d
-particle_filter: {num_particles: 40}
-active_sensing: {num_observation_samples: 3, num_cores: 1}
-simulator: {num_trials: 6, max_steps: 80, seed: 3}
-"""
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from tests.command_line import Workplace
+from tests.command_line import PEG, Workplace
 from tests.recordings import configuration_of, decided, flipped
 
 from holdfast.cli.run_figure import repeat, service_that_decided
@@ -21,17 +21,10 @@ from holdfast.protocol.question import OWN_PLANNER
 from holdfast.protocol.robot_events import Timing
 from holdfast.reports.recorder import Recorder
 
-PEG = """
-problem: peg_in_hole_2d
-particle_filter: {num_particles: 40}
-active_sensing: {num_observation_samples: 3, num_cores: 1}
-simulator: {num_trials: 1, max_steps: 60, seed: 3}
-"""
-
 
 def test_a_figure_of_this_run_and_of_an_earlier_one(workplace: Workplace) -> None:
     workplace.write("peg.yaml", PEG)
-    command = ["run", "peg.yaml", "--jobs", "1", "--out", "out"]
+    command = ["run", "peg.yaml", "--jobs", "1", "--trials", "1", "--out", "out"]
     assert workplace.run(*command, figures=True).code == 0
     figure = workplace.directory / "out" / "trial.png"
     assert figure.read_bytes().startswith(b"\x89PNG\r\n")
@@ -42,8 +35,10 @@ def test_a_figure_of_this_run_and_of_an_earlier_one(workplace: Workplace) -> Non
 
 
 def test_the_figure_of_any_trial_in_three_formats(workplace: Workplace) -> None:
-    workplace.write("peg.yaml", PEG.replace("num_trials: 1", "num_trials: 3"))
-    assert workplace.run("run", "peg.yaml", "--jobs", "1", "--out", "out").code == 0
+    workplace.write("peg.yaml", PEG)
+    assert (
+        workplace.run("run", "peg.yaml", "--jobs", "1", "--trials", "3", "--out", "out").code == 0
+    )
     drawn = {}
     for name, trials, beginning in (
         ("one.pdf", "1", b"%PDF"),
@@ -72,7 +67,7 @@ def test_the_figure_of_any_trial_in_three_formats(workplace: Workplace) -> None:
 
 def test_without_matplotlib_a_note_says_so(workplace: Workplace) -> None:
     workplace.write("peg.yaml", PEG)
-    said = workplace.run("run", "peg.yaml", "--out", "out")
+    said = workplace.run("run", "peg.yaml", "--trials", "1", "--out", "out")
     assert said.code == 0
     assert "note: no figure, because matplotlib is not installed" in said.stderr
 
