@@ -249,13 +249,3 @@ class TestGaussianMixture:
             exact = gaussian_entropy(variance) - weights @ np.log(weights)
             found = entropy(points, weights, GaussianMixture(variance, upper))
             assert abs(found - exact) < 1e-11
-
-    def test_weights_are_repeated_points(self) -> None:
-        """Exactly so: a mixture does not know its components apart."""
-        rng = np.random.default_rng(9)
-        points = rng.normal(size=(60, 3))
-        copies = rng.integers(1, 5, size=60)
-        for upper in (True, False):
-            estimator = GaussianMixture(np.array([0.1, 0.2, 0.3]), upper)
-            repeated = entropy(np.repeat(points, copies, axis=0), None, estimator)
-            assert abs(entropy(points, copies.astype(float), estimator) - repeated) < 1e-12

@@ -309,17 +309,6 @@ def test_ties_and_numbers_of_neighbours(kind: str, neighbors: int) -> None:
             assert_found(points, weights, k, resolution, case.expected_ways(), -1)
 
 
-@pytest.mark.parametrize("weighting", ["equal", "spread", "extreme"])
-@pytest.mark.parametrize("count", [6, 20, 65, 100, 500])
-def test_weights(count: int, weighting: str) -> None:
-    rng = np.random.default_rng([count, len(weighting)])
-    points = draw_points(rng, "spread", count, 3)
-    for survivors in {1, 2, count // 2, count}:
-        weights = draw_weights(rng, weighting, 5, count, survivors)
-        for neighbors in (1, min(12, count - 1)):
-            assert_matches(points, weights, neighbors, 0.05)
-
-
 @pytest.mark.parametrize("count", [20, 100, 600])
 def test_one_point_has_nearly_all_the_weight(count: int) -> None:
     """The others share so little that their share of the rest must not be lost in rounding."""

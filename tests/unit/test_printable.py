@@ -16,7 +16,6 @@ from holdfast.journal.tables import SummaryBuilder
 from holdfast.printable import brief, cell, one_line, printable
 from holdfast.protocol.messages import Refused, decode_reply, encode
 from holdfast.runtime.log_lines import json_line, text_line
-from holdfast.runtime.logs import EventLog
 from holdfast.transport.frames import read_goodbye
 
 HOSTILE = "\x1b[2J\x1b]0;title\x07\r\x9b1A\u202e\x7f"
@@ -171,11 +170,3 @@ def test_a_summary_is_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
     shown = capsys.readouterr().out
     assert "tcp/[fe80::1]:7447 3" in shown
     require_harmless(shown)
-
-
-def test_a_line_of_json_keeps_its_meaning(tmp_path: Path) -> None:
-    with EventLog(tmp_path / "events", format="json", component="robot") as log:
-        log.event("note", reason=HOSTILE)
-    line = (tmp_path / "events").read_text()
-    require_harmless(line)
-    assert json.loads(line)["reason"] == HOSTILE

@@ -265,12 +265,6 @@ class TestWhatIsRefused:
             ProblemEnv(**{**SMALL, **arguments})
         assert says in str(caught.value)
 
-    def test_an_action_that_does_not_exist(self) -> None:
-        inner = ProblemEnv(**SMALL)
-        inner.reset(seed=1)
-        with pytest.raises(InvalidValueError, match="action 3: peg_in_hole_2d has 0 to 2"):
-            inner.step(3)
-
     def test_a_step_without_a_reset(self) -> None:
         inner = ProblemEnv(**SMALL)
         with pytest.raises(gymnasium.error.ResetNeeded, match="no episode has begun"):

@@ -246,15 +246,6 @@ def test_what_comes_while_all_is_closed_ends_nothing_too_early(robots: Robots) -
     assert machine.trace == ["handle RecoveryExited"]
 
 
-def test_the_machine_is_woken_when_it_asks_for_it(robots: Robots) -> None:
-    robot, machine = scripted(robots, lambda: None)
-    now = time.monotonic()
-    machine.wakeups = [now + 0.05, now + 0.01]  # it asks for an earlier time later on
-    machine.answers = [[], [Paused()]]
-    robot.run(())
-    assert machine.trace == ["wake", "wake"]
-
-
 def test_an_earlier_time_replaces_a_later_one(robots: Robots) -> None:
     robot, machine = scripted(
         robots,
@@ -460,34 +451,6 @@ def test_what_takes_long_is_computed_on_a_thread_while_the_robot_goes_on(
 
 class TestPause:
     """What a process does that has something else on its main thread."""
-
-    def test_before_it_runs(self, robots: Robots) -> None:
-        robot = robots.make()
-        robot.pause(PATIENCE_S)
-        robot.run(())
-        assert robots.results == []
-        robots.run()
-        assert robots.digests == plain_digests(robots.configuration)
-
-    def test_in_the_middle_of_a_trial(self, robots: Robots) -> None:
-        robot = robots.make()
-        decisions = 0
-
-        def count(_: Timing) -> None:
-            nonlocal decisions
-            decisions += 1
-            if decisions == 5:
-                threading.Thread(target=robot.pause, args=(PATIENCE_S,)).start()
-
-        robots.on_timing = count
-        robot.run(())
-        unfinished = robots.directory.journal.unfinished()
-        if unfinished is not None:  # else the trial has ended meanwhile
-            assert isinstance(unfinished.records[-1], PausedRecord)
-        assert robot.condition().word == "ending"
-        robots.on_timing = lambda _: None
-        robots.run()
-        assert robots.digests == plain_digests(robots.configuration)
 
     def test_an_environment_that_does_not_return_is_left_alone(self, robots: Robots) -> None:
         called, let_go = threading.Event(), threading.Event()
