@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 from tests.recordings import decided, robot_configuration
@@ -39,7 +39,7 @@ from holdfast.protocol.status import Status
 from holdfast.robot import own_planner
 from holdfast.robot import process as robot_process
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
-from holdfast.robot.links import Links, make_links
+from holdfast.robot.links import make_links
 from holdfast.robot.process import RobotProcess
 from holdfast.runtime.events import BoundedEventLog
 
@@ -55,27 +55,21 @@ def configuration(tmp_path: Path) -> Configuration:
 class Robots(RecordingSink):
     """Makes robots that go on in one directory, and keeps what they say."""
 
-    def __init__(self, configuration: Configuration, path: Path) -> None:
+    def __init__(self, configuration: Configuration, directory: RunDirectory) -> None:
         super().__init__()
-        self.configuration = configuration
-        self.links: Links | None = None
+        self.configuration, self.directory = configuration, directory
+
         self.results: list[TrialResult] = []
         self.on_timing: Callable[[Timing], None] = lambda _: None
-        self.path = path
         self.maker = load_environment(configuration)
         self.on_order: Callable[[PlanningState, Act | Sense], None] | None = None
 
-    @functools.cached_property
-    def directory(self) -> RunDirectory:
-        """The run's; it belongs to the thread that asks for it first."""
-        return RunDirectory.create(self.path, self.configuration)
-
     def make(self) -> RobotProcess:
         configuration = self.configuration
-        self.links = make_links(configuration, None, BoundedEventLog())
+        links = make_links(configuration, None, BoundedEventLog())
         return RobotProcess(
             configuration,
-            self.links,
+            links,
             self.directory.journal,
             self.maker,
             self,
@@ -99,10 +93,8 @@ class Robots(RecordingSink):
 
 @pytest.fixture
 def robots(configuration: Configuration, tmp_path: Path) -> Iterator[Robots]:
-    robots = Robots(configuration, tmp_path / "run")
-    yield robots
-    if "directory" in vars(robots):
-        robots.directory.close()
+    with RunDirectory.create(tmp_path / "run", configuration) as directory:
+        yield Robots(configuration, directory)
 
 
 def plain_digests(configuration: Configuration) -> list[str]:
@@ -160,26 +152,10 @@ class Clock:
         self.ahead_s += seconds
 
 
-class NoWire:
-    """A transport over which nothing comes."""
-
-    def start(self, deliver: Callable[[TransportEvent], None]) -> None:
-        pass
-
-    def call(self, service: str, call: int, payload: bytes) -> None:
-        pass
-
-    def abandon(self, call: int) -> None:
-        pass
-
-    async def close(self, timeout_s: float = 1.0) -> None:
-        pass
-
-
 def scripted(robots: Robots, begin: Callable[[], object]) -> tuple[RobotProcess, Machine]:
     """Return a robot whose machine is a script, which begins with something of the test's own."""
     robot, machine = robots.make(), Machine()
-    robot._transport = NoWire()
+    robot._transport = Mock(close=AsyncMock())  # over which nothing comes
     robot.robot = machine  # type: ignore[assignment]
     robot._begin_next = begin  # type: ignore[method-assign, assignment]
     return robot, machine
@@ -229,20 +205,19 @@ def test_the_loop_looks_at_the_wire_before_it_handles_more_than_some_events(
 
 
 def test_what_comes_while_all_is_closed_ends_nothing_too_early(robots: Robots) -> None:
-    class SlowWire(NoWire):
-        is_closed = False
+    closed: list[bool] = []
 
-        async def close(self, timeout_s: float = 1.0) -> None:
-            robot._happens(RecoveryExited(2, "while the wire is closed"))
-            robot._on_loop().call_soon(robot._end)
-            await asyncio.sleep(0.01)
-            self.is_closed = True
+    async def close(timeout_s: float = 1.0) -> None:
+        robot._happens(RecoveryExited(2, "while the wire is closed"))
+        robot._on_loop().call_soon(robot._end)
+        await asyncio.sleep(0.01)
+        closed.append(True)
 
     robot, machine = scripted(robots, lambda: robot._happens(RecoveryExited(1, "ended")))
-    robot._transport = wire = SlowWire()
+    robot._transport = Mock(close=close)
     machine.answers = [[Paused()]]
     robot.run(())
-    assert wire.is_closed
+    assert closed == [True]
     assert machine.trace == ["handle RecoveryExited"]
 
 
