@@ -387,16 +387,16 @@ def test_anything(seed: int) -> None:
         assert_matches(points, weights, min(neighbors, count - 1), resolution, rows)
 
 
-@pytest.mark.parametrize("upper", [True, False])
 @pytest.mark.parametrize("way", WAYS)
-def test_gaussian_mixture(way: str, upper: bool) -> None:
+def test_gaussian_mixture(way: str) -> None:
     """Narrow components, which do not reach each other, wide ones, and both.
 
-    Each way has each dimension once and each kind of points once, and which come together changes
-    from way to way.
+    Each way has each kind of points once, and half of the dimensions with one of the bounds; which
+    come together changes from way to way.
     """
     case = WAYS[way]
     number = list(WAYS).index(way)
+    upper = number % 2 == 0
     rng = np.random.default_rng([*case[:3], 2])
     kinds = (("spread", 0.3), ("grid", 5.0), ("clusters", 0.01))
     for place, dimension in enumerate((1, 2, 6) if upper else (3, 4, 5)):

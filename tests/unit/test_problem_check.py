@@ -434,7 +434,6 @@ def test_prices_that_nobody_weighs() -> None:
     for selector in (
         SelectorSettings(nats_per_cost=0.1),
         SelectorSettings(method="expected_return"),
-        SelectorSettings(method="random"),
     ):
         own = check(kind_of("Priced")(), settings=PlanningSettings(selector=selector))
         assert not [each for each in own if each.check == "prices"]
