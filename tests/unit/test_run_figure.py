@@ -30,6 +30,7 @@ def test_the_figure_of_any_trial_in_three_formats(workplace: Workplace) -> None:
     drawn = {}
     for name, trials, beginning in (
         ("one.pdf", "1", b"%PDF"),
+        ("one.png", "1", b"\x89PNG"),
         ("one.svg", "1", b"<?xml"),
         ("again.svg", "1:3", b"<?xml"),
         ("again.pdf", "1:3", b"%PDF"),
