@@ -430,20 +430,16 @@ class TestPause:
     def test_an_environment_that_does_not_return_is_left_alone(self, robots: Robots) -> None:
         called, let_go = threading.Event(), threading.Event()
 
-        class Stuck:
-            def perform_sensing(self, sensing_action: int) -> list[float]:
-                called.set()
-                let_go.wait(PATIENCE_S)
-                return [0.0]
+        def stuck(sensing_action: int) -> list[float]:
+            called.set()
+            let_go.wait(PATIENCE_S)
+            return [0.0]
 
-            def perform(self, task_action: object) -> None:
-                raise NotImplementedError
-
-            def is_done(self) -> bool:
-                return False
+        def world() -> Mock:
+            return Mock(perform_sensing=stuck, is_done=lambda: False)
 
         problem = robots.configuration.problem
-        robots.maker = EnvironmentMaker("stuck", problem, 0, 60_000.0, Stuck)
+        robots.maker = EnvironmentMaker("stuck", problem, 0, 60_000.0, world)  # type: ignore[arg-type]
         robot = robots.make()
 
         def pause() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -82,21 +83,13 @@ def test_units_do_not_matter(size: int, scale: float) -> None:
     assert found == pytest.approx(usual, rel=1e-9)
 
 
-class TwoDoors:
-    """Observes the coordinates of the state."""
-
-    def __init__(self, variance: float) -> None:
-        self.variance = variance
-
-    def observation_mean(self, states: np.ndarray, sensing_action: int) -> np.ndarray:
-        return states
-
-    def observation_variance(self, states: np.ndarray, sensing_action: int) -> np.ndarray:
-        return np.full(states.shape[-1], self.variance)
-
-
 def within(belief: Belief, variance: float, *observed: float) -> bool:
-    return update(TwoDoors(variance), belief, 0, observed)[1].within_gate
+    """Tell what the gate says of an observation of the state's coordinates."""
+    problem: Any = SimpleNamespace(
+        observation_mean=lambda states, _: states,
+        observation_variance=lambda states, _: np.full(states.shape[-1], variance),
+    )
+    return update(problem, belief, 0, observed)[1].within_gate
 
 
 def test_one_mode_of_two_is_no_alarm() -> None:
