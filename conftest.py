@@ -213,9 +213,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.ros)
 
 
+_path: list[str] = []  # where a test begins to look for modules
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Note where modules are looked for, which a test's configurations may change."""
+    _path[:] = sys.path
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown() -> None:
     """Forget the modules of users that a test has loaded: others have copies of them elsewhere."""
+    sys.path[:] = _path
     user_modules = sys.modules.get("holdfast.config.user_modules")
     found = [] if user_modules is None else list(user_modules._FOUND.values())
     for directory, names in found:

@@ -6,14 +6,8 @@ digamma on one side, the kernel on the other. So the benchmark's ratio is one of
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from benchmarks import literal
 
 from holdfast.numerics.arrays import FloatArray

@@ -6,7 +6,6 @@ import importlib
 import random
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -333,13 +332,6 @@ def test_what_a_sensor_alone_shows_is_not_dominated(seed: int) -> None:
     ]
 
 
-@pytest.fixture
-def examples() -> Iterator[None]:
-    sys.path.insert(0, str(EXAMPLES))
-    yield
-    sys.path.remove(str(EXAMPLES))
-
-
 RIGHT = [
     *registry.BUILT_IN,
     "light_dark_room:LightDarkRoom",
@@ -353,7 +345,8 @@ WARNED = {"two_ends:TwoCues": {"sensors", "resolution"}, "two_ends:Sorting": {"r
 
 
 @pytest.mark.parametrize("name", RIGHT)
-def test_right_problems_have_no_error(name: str, examples: None) -> None:
+def test_right_problems_have_no_error(name: str) -> None:
+    sys.path.insert(0, str(EXAMPLES))
     module, _, kind = name.partition(":")
     problem = (
         hf.make_problem(name) if not kind else getattr(importlib.import_module(module), kind)()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -80,10 +79,7 @@ class TestProblemFactory:
                 known(opening(f"nobody_{number}"))
         assert looked == ["names"]
 
-    def test_own_problem_that_was_named(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(sys, "path", sys.path.copy())
+    def test_own_problem_that_was_named(self, tmp_path: Path) -> None:
         (tmp_path / "a_robot_of_ones_own.py").write_text(
             "from holdfast.problems.capsule_robot import CapsuleRobot\n"
             "class Mine(CapsuleRobot):\n    name = 'mine'\n"

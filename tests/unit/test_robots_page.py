@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-import sys
 import textwrap
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +17,6 @@ from holdfast.errors import ConfigurationError
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "docking.py"
 PAGE = (ROOT / "docs" / "robots.md").read_text(encoding="utf-8")
-
-
-@pytest.fixture(autouse=True)
-def forgotten_imports(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Other tests have modules of the example's name."""
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    yield
-    sys.modules.pop("docking", None)
 
 
 def test_what_it_quotes_stands_in_an_example() -> None:

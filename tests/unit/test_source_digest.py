@@ -55,8 +55,7 @@ OF_THE_ARM = {module_of(file) for file in SOURCES} - {"arm_stranger", "arm_parts
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    monkeypatch.setattr(sys, "path", sys.path.copy())
+def folder(tmp_path: Path) -> Iterator[Path]:
     for name, text in SOURCES.items():
         path = tmp_path / "arm" / name
         path.parent.mkdir(exist_ok=True, parents=True)
