@@ -345,7 +345,7 @@ def test_negligible_points_are_left_out(count: int, small: float, negligible: bo
 
 def test_more_posteriors_than_one_batch() -> None:
     """Weights are taken in batches of 64 MB: rows of the first, at the border and of the last."""
-    count = 4000
+    count = 2000
     batch = 8 * 2**20 // count
     posteriors = batch + 40
     rng = np.random.default_rng(7)
