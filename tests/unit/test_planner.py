@@ -85,7 +85,8 @@ class TestPurity:
             array.setflags(write=False)
         before = digest(state)
 
-        planner.choose_sensing_action(state)
+        sensing_action, _ = planner.choose_sensing_action(state)
+        assert 0 <= sensing_action < len(problem.sensing_actions)
         after, _ = planner.observe(state, 0, observation)
         action, info = planner.choose_task_action(after)
         action.setflags(write=False)
