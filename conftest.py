@@ -213,9 +213,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.ros)
 
 
+_path: list[str] = []  # where a test begins to look for modules
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Note where modules are looked for, which a test's configurations may change."""
+    _path[:] = sys.path
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown() -> None:
     """Forget the modules of users that a test has loaded: others have copies of them elsewhere."""
+    sys.path[:] = _path
     user_modules = sys.modules.get("holdfast.config.user_modules")
     found = [] if user_modules is None else list(user_modules._FOUND.values())
     for directory, names in found:
@@ -247,6 +257,14 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
         # Until the next one, for which a worker may wait as long as a test of another one takes, or
         # until the end of the process. While a test runs, pytest's bound holds (pyproject.toml).
         _end_unless_it_goes_on(item.config, 2.0)
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Any:
+    """Return a directory in which commands are run."""
+    from tests.command_line import Workplace
+
+    return Workplace(tmp_path, capsys)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
+import json
 import os
 import sys
 from pathlib import Path
@@ -52,6 +54,58 @@ def run_here(
     code = ended.value.code or 0
     assert isinstance(code, int), code
     return Said(code, said.out, said.err)
+
+
+PEG = """
+problem: peg_in_hole_2d
+particle_filter: {num_particles: 40}
+active_sensing: {num_observation_samples: 3, num_cores: 1}
+simulator: {num_trials: 6, max_steps: 80, seed: 3}
+"""
+"""A small run."""
+
+
+class Workplace:
+    """A directory in which commands are run."""
+
+    def __init__(self, directory: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.directory = directory
+        self._capsys = capsys
+
+    def write(self, name: str, text: str) -> None:
+        (self.directory / name).write_text(text)
+
+    def names(self) -> set[str]:
+        return {path.name for path in self.directory.iterdir()} - {"__pycache__"}
+
+    def run(self, *arguments: str, figures: bool = False) -> Said:
+        return run_here(self._capsys, self.directory, *arguments, figures=figures)
+
+    def runs(self, *arguments: str, figures: bool = False) -> Said:
+        """Run a command that is to come to its end; return what it says."""
+        said = self.run(*arguments, figures=figures)
+        assert said.code == 0, said
+        return said
+
+    def fails(self, *arguments: str) -> str:
+        """Run a command that is to be refused; return what it says."""
+        said = self.run(*arguments)
+        assert (said.code, said.stdout) == (2, ""), said
+        assert said.stderr.startswith("holdfast: error: ")
+        assert "Traceback" not in said.stderr
+        return said.stderr
+
+    def decided(self, out: str) -> list[tuple[str, ...]]:
+        """Return the table of trials, without the times."""
+        with (self.directory / out / "trials.csv").open() as file:
+            return [
+                tuple(value for key, value in row.items() if key != "mean_sensing_ms")
+                for row in csv.DictReader(file)
+            ]
+
+    def summary(self, out: str) -> dict[str, object]:
+        found: dict[str, object] = json.loads((self.directory / out / "summary.json").read_text())
+        return found
 
 
 def commands() -> dict[str, str]:

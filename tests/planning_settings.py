@@ -8,7 +8,7 @@ from holdfast.planning.settings import (
     PlanningSettings,
 )
 
-SEED, TRIAL, STEPS = 2**40 + 3, 6, 14
+SEED, TRIAL = 2**40 + 3, 6
 
 
 def planning_settings(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,3 +16,10 @@ def completed(
     return subprocess.run(
         command, capture_output=True, text=True, check=False, timeout=timeout, **more
     )
+
+
+def said_by(program: str, *arguments: str, flags: Sequence[str] = ()) -> str:
+    """Return what a Python program says in a process of its own, in which it does not fail."""
+    done = completed([sys.executable, *flags, "-c", program, *arguments])
+    assert done.returncode == 0, done.stderr
+    return done.stdout

@@ -94,22 +94,31 @@ def failed(result: TrialResult) -> TrialResult:
     return msgspec.structs.replace(result, success=False, failed=True)
 
 
+def flipped(result: TrialResult, byte: int = 9) -> TrialResult:
+    """Return the result with another decision; the byte is of the first sensing action."""
+    assert result.decisions is not None
+    log = bytearray(result.decisions.log)
+    log[byte] ^= 1
+    decisions = msgspec.structs.replace(result.decisions, log=bytes(log))
+    return msgspec.structs.replace(result, decisions=decisions, digest=decisions.digest())
+
+
 def without_decisions(result: TrialResult) -> TrialResult:
     """Return the result as the journal returns it."""
     return msgspec.structs.replace(result, decisions=None)
 
 
+def decided(configuration: Configuration, trial: int = 1, **more: Any) -> TrialResult:
+    """Return what a plain loop decides: without journal, wire and service."""
+    planner = Planner(configuration.problem, configuration.planning)
+    simulator = configuration.simulator
+    return run_trial(planner, simulator.seed, trial, max_steps=simulator.max_steps, **more)
+
+
 def record_trial(configuration: Configuration, trial: int = 1) -> Recorder:
     """Run a trial and record it."""
-    planner = Planner(configuration.problem, configuration.planning)
-    recorder = Recorder(trial, planner)
-    run_trial(
-        planner,
-        configuration.simulator.seed,
-        trial,
-        max_steps=configuration.simulator.max_steps,
-        observer=recorder,
-    )
+    recorder = Recorder(trial, Planner(configuration.problem, configuration.planning))
+    decided(configuration, trial, observer=recorder)
     return recorder
 
 

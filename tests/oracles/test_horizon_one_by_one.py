@@ -14,7 +14,6 @@ import pytest
 from benchmarks.horizon import one_by_one
 from tests.golden.sonar_room import SonarRoom
 
-from holdfast import _kernel
 from holdfast.config import registry
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.randomness import Purpose, Stream, stream
@@ -113,18 +112,6 @@ def test_blocks_change_nothing(largest: int, monkeypatch: pytest.MonkeyPatch) ->
     assert samples_of(problem, settings_of(SELECTORS[0]), belief, stage) == usual
 
 
-def test_threads_that_are_worth_their_waking(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Helpers take part however little there is to do, and change nothing."""
-    problem = PROBLEMS["multitier_peg_in_hole_2d"]()
-    belief, stage = on_the_way(problem, 300)
-    usual = samples_of(problem, settings_of(SELECTORS[0]), belief, stage)
-    before = _kernel.use_threads_from(0.0)
-    try:
-        assert samples_of(problem, settings_of(SELECTORS[0], 4), belief, stage) == usual
-    finally:
-        _kernel.use_threads_from(before)
-
-
 def test_stages_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some hypothetical beliefs have reached the light, and others have not."""
     asked: list[set[int]] = []
@@ -141,20 +128,6 @@ def test_stages_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     assert {0, 1} in asked
     monkeypatch.setattr(sensing, "_later_entropies", one_by_one)
     assert samples_of(LightDark(), settings_of(SELECTORS[0]), belief, 0) == together
-
-
-@pytest.mark.parametrize("name", [*registry.names()])
-def test_beliefs_are_moved_as_one_after_the_other(name: str) -> None:
-    problem = PROBLEMS[name]()
-    beliefs = [on_the_way(problem, count)[0].states for count in (150, 150, 150)]
-    states = np.stack(beliefs) + np.array([0.0, 0.01, 0.02])[:, np.newaxis, np.newaxis]
-    actions = problem.limit_action(problem.policy(states[:, 0], 0))
-    streams = [stream(63, 0, step, Purpose.PREDICTION) for step in range(3)]
-    alone = np.stack([problem.move(*each) for each in zip(states, actions, streams, strict=True)])
-    for threads in (1, 2, 0):
-        anew = [each.anew() for each in streams]
-        together = problem.move_each(states, actions, anew, threads)
-        assert together.tobytes() == alone.tobytes()
 
 
 def test_who_moves_otherwise_does_not_inherit_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:

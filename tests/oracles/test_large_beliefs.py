@@ -13,8 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from tests.oracles import test_entropy_reference as small
-from tests.oracles.reference_entropy import nearest_neighbor_entropy
-from tests.oracles.test_entropy_reference import TOLERANCE, WAYS, Ways, draw_weights, find
+from tests.oracles.test_entropy_reference import TOLERANCE, WAYS, draw_weights, find
 
 from holdfast import _kernel
 from holdfast.numerics.arrays import FloatArray
@@ -72,10 +71,7 @@ def test_blocks_against_the_reference(
     points = draw_belief(kind, count, dimension)
     rng = np.random.default_rng([8, posteriors])
     weights = draw_weights(rng, "similar", posteriors, count, count - 200)
-    found = find(points, weights, NearestNeighbor(5, resolution))
-    assert found.ways == (Ways(own_tree=1) if posteriors == 1 else Ways(grouped=posteriors))
-    expected = nearest_neighbor_entropy(points, weights[-1], 5, resolution)
-    assert abs(found.entropies[-1] - expected) <= TOLERANCE
+    small.assert_found(points, weights, 5, resolution, small.by_trees(posteriors), -1)
 
 
 @pytest.mark.parametrize("neighbors", [1, 8, 9, 30])

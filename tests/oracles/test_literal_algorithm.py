@@ -6,19 +6,11 @@ digamma on one side, the kernel on the other. So the benchmark's ratio is one of
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from benchmarks import literal
-from tests.oracles.reference_entropy import nearest_neighbor_entropy
 
 from holdfast.numerics.arrays import FloatArray
-from holdfast.numerics.randomness import Purpose, stream
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.settings import (
     ActiveSensingSettings,
@@ -78,17 +70,3 @@ def test_every_decision_of_a_trial(problem: Problem, num_particles: int) -> None
         environment.perform(task_action)
         state = planner.advance(state, task_action)
     assert decisions >= 5
-
-
-@pytest.mark.parametrize("estimate", ESTIMATES)
-@pytest.mark.parametrize("resolution", [1e-3, 0.25])
-def test_literal_entropy_is_the_reference_with_ties(
-    resolution: float, estimate: literal.Entropy
-) -> None:
-    """Points on a grid of powers of two: distances tie, also with the resolution, exactly."""
-    draws = stream(7, 0, 0, Purpose.INITIAL_BELIEF)
-    points = np.floor(draws.uniform((60, 2)) * 12.0) / 8.0
-    weights = draws.substream(1).uniform(60)
-    mine = estimate(points, weights / weights.sum(), 5, resolution)
-    reference = nearest_neighbor_entropy(points, weights / weights.sum(), 5, resolution)
-    assert mine == pytest.approx(reference, abs=TOLERANCE)

@@ -140,20 +140,6 @@ def test_threads_change_nothing(count: int, estimator: str) -> None:
     assert len(found) == 1
 
 
-@pytest.mark.parametrize("name", registry.names())
-def test_every_registered_problem_has_a_way(name: str) -> None:
-    """Where nothing is near, that is state plus action, one particle at a time or all at once."""
-    problem = registry.problem_class(name).from_settings({}, {})
-    belief = some_belief(problem, 50, "uniform")
-    settings = path((0, 3, 40))
-    points, factors = path_points(problem, settings, belief.states, 0)
-    assert points.shape == (3, 50, problem.action_size)
-    assert factors == (1.0, 1.0, 1.0)
-    for n in (0, 17, 49):
-        alone, _ = path_points(problem, settings, belief.states[n : n + 1], 0)
-        np.testing.assert_array_equal(alone[:, 0], points[:, n])
-
-
 @pytest.mark.parametrize("name", [*registry.names(), "busy_room"])
 def test_the_kernel_follows_as_numpy_does(name: str) -> None:
     """Bit for bit, through contacts and stages, for one way of several hundred steps."""
@@ -273,61 +259,61 @@ class TestErrors:
         with pytest.raises(InvalidValueError, match="must increase strictly"):
             choose(problem, path((3, 3)), some_belief(problem, 40, "uniform"))
 
-    def test_shape_of_the_expected_move(self) -> None:
-        class Wrong(Drifting):
-            def expected_move(self, states: FloatArray, actions: FloatArray) -> FloatArray:
-                return states[:1]
-
-        with pytest.raises(ProblemError, match=r"expected_move of plane.*\(40, 3\)"):
-            choose(Wrong(), path(), some_belief(Wrong(), 40, "uniform"))
-
-    @pytest.mark.parametrize("found", [np.zeros((1, 3)), np.zeros(3), [[0.0] * 3]])
-    def test_shape_of_what_is_executed(self, found: Any) -> None:
-        class Wrong(Plane):
-            def limit_action(self, actions: FloatArray) -> FloatArray:
-                return found  # type: ignore[no-any-return]
-
-        with pytest.raises(ProblemError, match=r"limit_action of plane returned .*\(40, 3\)"):
-            choose(Wrong(), path(), some_belief(Plane(), 40, "uniform"))
-
-    def test_call_of_the_expected_move(self) -> None:
-        class Wrong(Drifting):
-            def expected_move(self, states: FloatArray) -> FloatArray:  # type: ignore[override]
-                return states
-
-        with pytest.raises(ProblemError, match=r"called as expected_move\(states, actions\)"):
-            check_problem(Wrong())
-
-    def test_actions_that_grow_on_the_way(self) -> None:
-        class Wrong(Plane):
-            def limit_action(self, actions: FloatArray) -> FloatArray:
-                return -1e60 * actions
-
-        with pytest.raises(ProblemError, match=r"policy of plane.*in state .*, 3 steps on"):
-            choose(Wrong(), path((0, 3)), some_belief(Wrong(), 40, "uniform"))
-
     @pytest.mark.parametrize(
-        ("stages", "message"),
+        ("base", "function", "wrong", "message"),
         [
-            (np.full(40, 3), "next_stage of plane has the stage 3 for state"),
-            (np.full(40, -1), "next_stage of plane has the stage -1 for state"),
-            (np.zeros(40), r"next_stage of plane .*: need an array of integers of shape \(40,\)"),
-            (1, "next_stage of plane"),
+            (
+                Drifting,
+                "expected_move",
+                lambda _, states, __: states[:1],
+                r"expected_move of plane.*\(40, 3\)",
+            ),
+            *(
+                (
+                    Plane,
+                    "limit_action",
+                    lambda *_, found=found: found,
+                    r"limit_action of plane returned .*\(40, 3\)",
+                )
+                for found in (np.zeros((1, 3)), np.zeros(3), [[0.0] * 3])
+            ),
+            (
+                Plane,
+                "limit_action",
+                lambda _, actions: -1e60 * actions,
+                r"policy of plane.*in state .*, 3 steps on",
+            ),
+            *(
+                (
+                    Plane,
+                    "next_stage",
+                    lambda *_, stages=stages: stages,
+                    f"next_stage of plane{says}",
+                )
+                for stages, says in (
+                    (np.full(40, 3), " has the stage 3 for state"),
+                    (np.full(40, -1), " has the stage -1 for state"),
+                    (np.zeros(40), r" .*: need an array of integers of shape \(40,\)"),
+                    (1, ""),
+                )
+            ),
+            # A path into nowhere is not the policy's.
+            (
+                Drifting,
+                "expected_move",
+                lambda _, states, __: states + np.nan,
+                r"led from the state .* in 3 steps to .*nan",
+            ),
         ],
     )
-    def test_stages(self, stages: IntArray, message: str) -> None:
-        class Wrong(Plane):
-            def next_stage(self, estimates: FloatArray, stage: int | IntArray) -> int | IntArray:
-                return stages
-
+    def test_what_the_path_meets_on_the_way(
+        self, base: type[Plane], function: str, wrong: object, message: str
+    ) -> None:
+        problem: Any = type("Wrong", (base,), {function: wrong})()
         with pytest.raises(ProblemError, match=message):
-            choose(Wrong(), path(), some_belief(Wrong(), 40, "uniform"))
+            choose(problem, path((0, 3)), some_belief(Plane(), 40, "uniform"))
 
-    def test_a_path_into_nowhere_is_not_the_policys(self) -> None:
-        class Lost(Drifting):
-            def expected_move(self, states: FloatArray, actions: FloatArray) -> FloatArray:
-                return np.asarray(states + np.nan)
-
-        states = np.array([[1.0, 2.0, 3.0]])
-        with pytest.raises(ProblemError, match=r"led from the state .* in 1 steps to .*nan"):
-            path_points(Lost(), path((0, 1)), states, 0)
+    def test_call_of_the_expected_move(self) -> None:
+        problem: Any = type("Wrong", (Drifting,), {"expected_move": lambda _, states: states})()
+        with pytest.raises(ProblemError, match=r"called as expected_move\(states, actions\)"):
+            check_problem(problem)

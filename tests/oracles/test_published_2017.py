@@ -21,26 +21,12 @@ as much. With its holes our successes agree (746 and 739) and our mean reward do
 The mean reward of capsule_robot
 --------------------------------
 Its successes agree, its mean reward does not: -0.15 here, -7.549 in 2017, with a standard deviation
-of 5.0 over the first 210 logged trials. The log shows that another model ran:
-
-- Its list of parameters has ``dt = 0.1`` and no ``step_size``; in the published source it is the
-  other way round. It lists neither gains nor via points.
-- Its steps were several times smaller. What it gives as a trial's mean sensing time is, for n
-  steps, the sum of ceil(n / 11) times over floor((n + 1) / 11). At the 139 steps that a trial takes
-  here, the quotient of the two counts alone would scatter the logged times by 2.9 % (standard
-  deviation), at twice that by 1.5 %. The state-entropy trials 20 to 71 scatter by 1.1 %, all causes
-  together. (In the logs of `peg_in_hole_2d` short trials do show the effect.) Steps of dt * 0.1
-  fit: they make n 1,400.
-
-About 200 variants of steps, gains, limits, noise and costs were run to find one that gives both
-1,000 successes and the mean -7.549; the table is in this file's history.
-
-So the size and the spread of the logged reward are those of looking for a collision at the new
-state plus the whole commanded action, in small steps. Some variants would pass the tests below,
-with gains of 0.2 to 1, or sliding along walls. But each rests on something that neither the logs
-nor the published source and configuration confirm, and among 200 variants to pass is no evidence.
-Which model ran stays open: the mean reward is an expected failure below, and the row supports the
-successes alone.
+of 5.0 over the first 210 logged trials. The log shows that another model ran: it lists ``dt`` and
+no ``step_size``, no gains and no via points, where the published source has the opposite, and the
+scatter of its sensing times fits steps several times smaller. About 200 variants of steps, gains,
+limits, noise and costs were tried; some pass the tests below, but each rests on something that
+neither the logs nor the published source confirm, and among 200 to pass is no evidence. So the mean
+reward is an expected failure below, and the row supports the successes alone.
 """
 
 from __future__ import annotations

@@ -324,7 +324,8 @@ def test_beliefs(problem: Problem, count: int, kind: str) -> None:
 @pytest.mark.parametrize("actions", ["commanded", "executed"])
 @pytest.mark.parametrize("method", ["action_entropy", "state_entropy"])
 @pytest.mark.parametrize(
-    "estimator", ["nearest_neighbor", "prior_neighbors", "gaussian_mixture_upper"]
+    "estimator",
+    ["nearest_neighbor", "prior_neighbors", "gaussian_mixture_lower", "gaussian_mixture_upper"],
 )
 @pytest.mark.parametrize("resolution", [None, 0.4])
 def test_selectors(method: str, actions: str, estimator: str, resolution: float | None) -> None:
@@ -406,12 +407,6 @@ def test_numbers_of_samples_and_neighbours(samples: int, neighbors: int) -> None
     compare(problem, settings, some_belief(problem, 50, "weighted"))
 
 
-def test_lower_bound_of_the_mixture() -> None:
-    selector = SelectorSettings(method="action_entropy", estimator="gaussian_mixture_lower")
-    problem = Plane()
-    compare(problem, settings_of(selector=selector), some_belief(problem, 60, "weighted"))
-
-
 @pytest.mark.parametrize(("horizon", "discount"), [(2, 1.0), (2, 0.5), (3, 0.7), (2, 0.0)])
 @pytest.mark.parametrize("problem", [Plane(), LightDark()], ids=lambda p: p.name)
 def test_horizon(problem: Problem, horizon: int, discount: float) -> None:
@@ -462,73 +457,6 @@ def test_general_likelihood_with_the_same_draws(
         assert expected.samples is not None
         np.testing.assert_allclose(info.samples, expected.samples, rtol=0.0, atol=TOLERANCE)
         assert index == expected_index
-
-
-def test_general_likelihood_with_its_own_draws() -> None:
-    """Other draws, the same expectation.
-
-    Mean entropies of 300 independent choices in either way: for each sensing action a t-test of the
-    difference at 1e-6, on a belief for which the sensors differ by far more than its reach.
-    """
-
-    class OwnDraws(General):
-        def sample_observation(
-            self, state: FloatArray, sensing_action: int, stream: Stream
-        ) -> FloatArray:
-            mean = self._problem.observation_mean(state, sensing_action)
-            variance = self._problem.observation_variance(state, sensing_action)
-            return np.asarray(mean + np.sqrt(variance) * stream.normal(mean.shape))
-
-    inner, choices = LightDark(), 300
-    settings = settings_of(samples=5)
-    belief = some_belief(inner, 60, "weighted")
-    found = np.empty((2, choices, 3))
-    for choice in range(choices):
-        for way in (0, 1):
-            hypotheses = stream(34, way, choice, Purpose.HYPOTHESES)
-            own: Problem = OwnDraws(inner, hypotheses, 5)  # type: ignore[assignment]
-            problem: Problem = own if way == 1 else inner
-            _, info = choose_sensing_action(problem, settings, belief, 0, hypotheses, hypotheses)
-            found[way, choice] = info.entropies
-    for j in range(3):
-        assert stats.ttest_ind(*found[:, :, j], equal_var=False).pvalue > 1e-6
-    error = found.std(axis=1, ddof=1) / np.sqrt(choices)
-    means = np.sort(found.mean(axis=(0, 1)))
-    assert np.diff(means).min() > 5.0 * error.max()
-
-
-def test_stratified_particles() -> None:
-    """Sample i is drawn from the i-th part of the cumulated weight, and all samples follow it.
-
-    Over 500 choices, a chi-square test of the numbers of draws at 1e-6; strata only make it milder.
-    """
-    choices, samples = 500, 4
-    problem, settings = Plane(), settings_of(samples=samples)
-    belief = some_belief(problem, 20, "weighted")
-    upper = np.cumsum(belief.weights)
-    lower = upper - belief.weights
-    seen: list[int] = []
-
-    class Watched(General):
-        def sample_observation(
-            self, state: FloatArray, sensing_action: int, stream: Stream
-        ) -> FloatArray:
-            seen.append(int((belief.states == state).all(axis=1).argmax()))
-            return super().sample_observation(state, sensing_action, stream)
-
-    drawn = np.zeros(20)
-    for choice in range(choices):
-        hypotheses = stream(35, 0, choice, Purpose.HYPOTHESES)
-        watched: Problem = Watched(problem, hypotheses, samples)  # type: ignore[assignment]
-        seen.clear()
-        choose_sensing_action(watched, settings, belief, 0, hypotheses, hypotheses)
-        # The same particles for every sensing action.
-        assert seen == seen[:samples] * 3
-        for i, particle in enumerate(seen[:samples]):
-            assert lower[particle] < (i + 1) / samples
-            assert upper[particle] > i / samples
-            drawn[particle] += 1
-    assert stats.chisquare(drawn, choices * samples * belief.weights).pvalue > 1e-6
 
 
 @pytest.mark.parametrize("kind", ["equal", "spread", "extreme", "zeros", "short", "one"])

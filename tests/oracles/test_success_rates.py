@@ -9,37 +9,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
 import pytest
 from scipy import stats
+from tests.recordings import decided
 
-from holdfast.config.loader import Configuration, load
-from holdfast.planning.planner import Planner
-from holdfast.robot.trial import run_trial
+from holdfast.config.loader import load
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 TRUE_RATE = 0.995
 
 
-def successes(configuration: Configuration, num_particles: int, max_steps: int, seed: int) -> int:
-    planning = msgspec.structs.replace(
-        configuration.planning,
-        particle_filter=msgspec.structs.replace(
-            configuration.planning.particle_filter, num_particles=num_particles
-        ),
-    )
-    simulator = msgspec.structs.replace(configuration.simulator, max_steps=max_steps, seed=seed)
-    assert planning.selector.method == "path_entropy"
-    assert planning.sensing_interval == 8
-    return sum(
-        run_trial(
-            Planner(configuration.problem, planning),
-            simulator.seed,
-            trial,
-            max_steps=simulator.max_steps,
-        ).success
-        for trial in range(simulator.num_trials)
-    )
+def successes(example: str, num_trials: int, num_particles: int, max_steps: int) -> int:
+    changes = {"particle_filter.num_particles": num_particles, "simulator.max_steps": max_steps}
+    configuration = load(EXAMPLES / example, overrides={**changes, "simulator.seed": 0})
+    assert configuration.planning.selector.method == "path_entropy"
+    assert configuration.planning.sensing_interval == 8
+    return sum(decided(configuration, trial).success for trial in range(num_trials))
 
 
 def false_alarm(num_trials: int, least: int) -> float:
@@ -58,8 +43,7 @@ def false_alarm(num_trials: int, least: int) -> float:
 def test_peg_in_hole(num_trials: int, least: int) -> None:
     """At most 500 steps, 100 particles, a measurement at every ninth step."""
     assert false_alarm(num_trials, least) < 1e-3
-    configuration = load(EXAMPLES / "peg_in_hole_2d.yaml", num_trials=num_trials)
-    assert successes(configuration, 100, 500, 0) >= least
+    assert successes("peg_in_hole_2d.yaml", num_trials, 100, 500) >= least
 
 
 @pytest.mark.slow
@@ -69,7 +53,6 @@ def test_the_thesis(num_particles: int) -> None:
 
     False alarms: 1.1e-3 for each number.
     """
-    configuration = load(EXAMPLES / "thesis.yaml")
-    assert configuration.simulator.num_trials == 10
-    assert configuration.simulator.max_steps == 700
-    assert successes(configuration, num_particles, 700, 0) >= 9
+    simulator = load(EXAMPLES / "thesis.yaml").simulator
+    assert (simulator.num_trials, simulator.max_steps) == (10, 700)
+    assert successes("thesis.yaml", 10, num_particles, 700) >= 9

@@ -19,7 +19,7 @@ from holdfast import _kernel
 from holdfast.numerics.arrays import FloatArray, IntArray
 from holdfast.numerics.randomness import Stream
 from holdfast.planning import sensing
-from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.planner import Planner
 from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,
@@ -33,8 +33,6 @@ from holdfast.problems.peg_in_hole_3d import PegInHole3D
 from holdfast.problems.problem import ProblemBase
 from holdfast.robot.environment import SimulatedEnvironment
 from studies.light_dark import LightDark
-
-PEG = PegInHole2D()
 
 
 class Rescaled(ProblemBase):
@@ -104,7 +102,7 @@ class Choice(NamedTuple):
 
 
 PROBLEMS: dict[str, ProblemBase] = {
-    "plane": PEG,
+    "plane": PegInHole2D(),
     "space": PegInHole3D(),
     "three plates": MultitierPegInHole2D(),
     "capsule": CapsuleRobot(),
@@ -276,29 +274,3 @@ def test_the_same_sensing_in_other_units(name: str, selector: SelectorSettings) 
         np.testing.assert_allclose(
             np.frombuffer(other.task_action), np.frombuffer(one.task_action), rtol=0.0, atol=1e-9
         )
-
-
-# What one number for all coordinates makes of it: what it is for an array to mend.
-
-
-@pytest.fixture(scope="module")
-def states() -> list[PlanningState]:
-    """The states of a few trials in which something was sensed."""
-    settings = PlanningSettings(
-        selector=SelectorSettings(method="action_entropy", estimator="nearest_neighbor")
-    )
-    found = []
-    planner = Planner(PEG, settings)
-    for trial in range(12):
-        environment = SimulatedEnvironment(PEG, 7, trial)
-        state = planner.init(7, trial)
-        while not environment.is_done() and state.step < 200:
-            if planner.needs_sensing(state):
-                found.append(state)
-                action, _ = planner.choose_sensing_action(state)
-                shown = environment.perform_sensing(action)
-                state, _ = planner.observe(state, action, shown)
-            task_action, _ = planner.choose_task_action(state)
-            environment.perform(task_action)
-            state = planner.advance(state, task_action)
-    return found

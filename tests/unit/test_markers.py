@@ -7,7 +7,7 @@ import pytest
 
 from holdfast.planning.belief import Belief
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-from holdfast.reports.markers import scene_markers, sensing_markers
+from holdfast.reports.markers import sensing_markers
 from holdfast.reports.poses import PoseLayout, pose_layout
 
 
@@ -16,19 +16,6 @@ def layout() -> PoseLayout:
     found = pose_layout(PegInHole2D())
     assert found is not None
     return found
-
-
-def test_the_scene_has_obstacles_goal_and_a_body_in_each_frame(layout: PoseLayout) -> None:
-    markers = scene_markers(PegInHole2D(), layout, "task", "estimate", "truth")
-    assert {marker.namespace for marker in markers} >= {"obstacle", "body_estimate", "body_truth"}
-    for marker in markers:
-        assert marker.moves_with_frame == marker.namespace.startswith("body")
-        assert np.isfinite([*marker.pose, *marker.scale]).all()
-    assert not [
-        marker
-        for marker in scene_markers(PegInHole2D(), layout, "task", None, None)
-        if marker.moves_with_frame
-    ]
 
 
 @pytest.mark.parametrize(("action", "kind"), [(0, "ARROW"), (1, "ARROW"), (2, "LINE_STRIP")])

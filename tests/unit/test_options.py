@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
-from tests.command_line import commands, options_of
+from tests.command_line import Workplace, commands, options_of
 
-from holdfast.cli import main
 from holdfast.runtime.command_line import Option, location
 
 
@@ -38,57 +36,42 @@ PATHS = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "peg.yaml").write_text("problem: peg_in_hole_2d\n")
+Refused = Callable[..., str]
 
 
-def last_words(
-    arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> str:
+@pytest.fixture
+def last_words(workplace: Workplace) -> Refused:
     """Run a command that is to be refused, and return the one line that it says."""
-    monkeypatch.setattr(sys, "argv", ["holdfast", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err.startswith("holdfast: error: ")
-    assert said.err.count("\n") == 1, said.err
-    assert sorted(path.name for path in Path().iterdir()) == ["peg.yaml"]
-    return said.err
+    workplace.write("peg.yaml", "problem: peg_in_hole_2d\n")
+
+    def run(*arguments: str) -> str:
+        said = workplace.fails(*arguments)
+        assert said.count("\n") == 1, said
+        assert workplace.names() == {"peg.yaml"}
+        return said
+
+    return run
 
 
 @pytest.mark.parametrize("value", ["ten", "-1", "1e400"])
 @pytest.mark.parametrize(("words", "option"), NUMBERS, ids=lambda each: "".join(each))
-def test_a_number(
-    words: list[str],
-    option: str,
-    value: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line = last_words([*words, value], capsys, monkeypatch)
+def test_a_number(words: list[str], option: str, value: str, last_words: Refused) -> None:
+    line = last_words(*words, value)
     assert option in line
     assert value in line
 
 
 @pytest.mark.parametrize("value", ["1e-300", "0", "0.0009", "10001", "inf"])
-def test_a_rate(
-    value: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    line = last_words(["run", "peg.yaml", "--rate", value], capsys, monkeypatch)
+def test_a_rate(value: str, last_words: Refused) -> None:
+    line = last_words("run", "peg.yaml", "--rate", value)
     assert line == (
         f"holdfast: error: --rate is '{value}'; allowed are numbers from 0.001 to 10000 (Hz)\n"
     )
 
 
 @pytest.mark.parametrize("words", PATHS, ids=" ".join)
-def test_an_empty_path_is_not_the_current_directory(
-    words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    line = last_words([*words, ""], capsys, monkeypatch)
+def test_an_empty_path_is_not_the_current_directory(words: list[str], last_words: Refused) -> None:
+    line = last_words(*words, "")
     assert "''" in line
     assert "(. is the current directory)" in line
 
@@ -99,7 +82,7 @@ def test_an_empty_path_is_not_the_current_directory(
         (["nonsense"], "'nonsense' is no command; commands are run, serve, "),
         (["rnu", "peg.yaml"], "'rnu' is no command; did you mean run?"),
         (["--versoin"], "'--versoin' is no option of holdfast; did you mean --version?"),
-        (["peg.yaml"], "peg.yaml is no command; did you mean: holdfast run peg.yaml"),
+        (["peg.yaml", "--jobs", "2"], "no command; did you mean: holdfast run peg.yaml --jobs 2\n"),
         (["run", "peg.yaml", "--nonsense"], "--nonsense"),
         (["run", "peg.yaml", "again"], "again"),
         (["run", "peg.yaml", "--trials"], "--trials"),
@@ -107,10 +90,7 @@ def test_an_empty_path_is_not_the_current_directory(
         (["serve", "--nonsense"], "--nonsense"),
         (["serve", "--log", "xml"], "--log"),
         (["serve", "--listen", "tcp/nowhere"], "--listen: endpoint 'tcp/nowhere' has no port"),
-        (
-            ["serve", "--listen", "tcp/0.0.0.0:1"],
-            "--listen: endpoint tcp/0.0.0.0:1: other machines",
-        ),
+        (["serve", "--listen", "tcp/0.0.0.0:1"], "endpoint tcp/0.0.0.0:1: other machines"),
         (["run", "peg.yaml", "--log", "jsno"], "allowed are text and json; did you mean json?"),
         (["run", "peg.yaml", "--trails", "3"], "no option of holdfast run; did you mean --trials?"),
         (["run", "peg.yaml", "--quiet=3"], "--quiet takes no value"),
@@ -118,22 +98,12 @@ def test_an_empty_path_is_not_the_current_directory(
         (["keys", "mine", "--revoke-serial", "xyz"], "--revoke-serial is 'xyz'; allowed are hex"),
     ],
 )
-def test_other_misuse(
-    arguments: list[str],
-    reason: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    assert reason in last_words(arguments, capsys, monkeypatch)
+def test_other_misuse(arguments: list[str], reason: str, last_words: Refused) -> None:
+    assert reason in last_words(*arguments)
 
 
 @pytest.mark.parametrize("arguments", [[], ["run"], ["compare"], ["export"], ["view"], ["keys"]])
-def test_without_arguments_there_is_help(
-    arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["holdfast", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    said = capsys.readouterr()
-    assert ended.value.code in (0, 2)
-    assert (said.out + said.err).startswith("usage: holdfast")
+def test_without_arguments_there_is_help(arguments: list[str], workplace: Workplace) -> None:
+    said = workplace.run(*arguments)
+    assert said.code in (0, 2)
+    assert (said.stdout + said.stderr).startswith("usage: holdfast")

@@ -17,7 +17,6 @@ from holdfast.planning.outcome import (
     DecisionLog,
     Decisions,
     RewardAccount,
-    TrialResult,
 )
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
@@ -102,20 +101,7 @@ def test_sensing_actions_cost_their_price() -> None:
     ],
 )
 def test_outcomes(ending: dict[str, Any], outcome: str) -> None:
-    result = TrialResult(
-        trial=0,
-        seed=0,
-        steps=2,
-        reward=None,
-        sensing_decisions=1,
-        mean_sensing_ms=0.0,
-        recoveries=0,
-        unexplained_observations=0,
-        digest="",
-        sensing_ms=(),
-        **ending,
-    )
-    assert result.outcome == outcome
+    assert msgspec.structs.replace(result_of(0), **ending).outcome == outcome
 
 
 def test_every_column_is_of_a_result() -> None:

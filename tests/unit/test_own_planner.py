@@ -11,12 +11,11 @@ import pytest
 from tests.recordings import robot_configuration
 
 from holdfast.config.loader import Configuration
-from holdfast.errors import ProblemError
 from holdfast.planning.planner import Decision, Planner, PlanningState
 from holdfast.planning.settings import ParticleFilterSettings, PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.question import OWN_PLANNER, InProcessSource, Question
-from holdfast.protocol.robot_events import ComputeOwnAnswer, Halt, OwnAnswer
+from holdfast.protocol.robot_events import ComputeOwnAnswer, OwnAnswer
 from holdfast.robot import own_planner
 from holdfast.robot.own_planner import OwnPlanner
 
@@ -53,17 +52,6 @@ def test_the_source_asks_for_the_second_part_when_the_first_has_come(
     source.drop()
     source.handle(done, 2.0)
     assert source.effects.take() == []
-
-
-def test_an_error_of_the_planner_stops_the_source(configuration: Configuration) -> None:
-    _, asked = question(configuration)
-    source = InProcessSource()
-    source.ask(asked, 0.0)
-    source.effects.take()
-    error = ProblemError("policy gives nan")
-    source.handle(OwnAnswer(1, failure=error), 0.1)
-    assert source.stopped
-    assert source.effects.take() == [Halt(error)]
 
 
 def _fail(error: BaseException) -> None:

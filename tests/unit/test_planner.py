@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 from tests.line_problem import Line
-from tests.planning_settings import SEED, STEPS, TRIAL, planning_settings
+from tests.planning_settings import SEED, TRIAL, planning_settings
 
 from holdfast.config import registry
 from holdfast.errors import InvalidValueError, ProblemError
-from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.randomness import Stream
 from holdfast.planning import planner as planning
 from holdfast.planning.belief import Belief
 from holdfast.planning.planner import (
     Planner,
-    PlanningState,
     decode_checkpoint,
     digest,
     encode_checkpoint,
@@ -32,7 +31,6 @@ from holdfast.planning.settings import (
 )
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
-from holdfast.robot.environment import SimulatedEnvironment
 
 
 @pytest.fixture(scope="module", params=registry.names())
@@ -47,107 +45,33 @@ def peg() -> Problem:
     return PegInHole2D()
 
 
-class Decision(NamedTuple):
-    """The state before a call, and what the call was given from outside and returned."""
+def test_static_parameters_are_drawn_anew() -> None:
+    """And the same again, from a checkpoint: so says every service."""
 
-    state: PlanningState
-    kind: str
-    outside: bytes
-    returned: bytes
+    class Landmark(Line):
+        def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+            moved = states + actions + 0.1 * stream.normal(states.shape)
+            moved[..., 1] = states[..., 1]
+            return moved
 
+    class Named(Landmark):
+        static_parameters = (1,)
 
-def go_on(
-    problem: Problem,
-    configured: PlanningSettings,
-    state: PlanningState,
-    observations: dict[int, FloatArray],
-    until: int,
-) -> Iterator[Decision]:
-    """Yield decisions from a state on; what the world shows is given by step."""
-    planner = Planner(problem, configured)
-    while state.step < until:
-        if planner.needs_sensing(state):
-            index, info = planner.choose_sensing_action(state)
-            assert info.samples is not None
-            yield Decision(state, "sense", b"", bytes([index]) + info.samples.tobytes())
-            observation = observations[state.step]
-            before = state
-            state, _ = planner.observe(state, index, observation)
-            yield Decision(before, "observe", observation.tobytes(), digest(state))
-        action, task_info = planner.choose_task_action(state)
-        told = action.tobytes() + task_info.estimate.tobytes() + task_info.commanded.tobytes()
-        yield Decision(state, "act", b"", told + bytes([task_info.stage]))
-        before = state
-        state = planner.advance(state, action)
-        yield Decision(before, "advance", action.tobytes(), digest(state))
-
-
-def observations_of(problem: Problem, configured: PlanningSettings) -> dict[int, FloatArray]:
-    """Return what a simulated world shows at each sensing step."""
-    environment = SimulatedEnvironment(problem, SEED, TRIAL)
-    planner = Planner(problem, configured)
-    state = planner.init(SEED, TRIAL)
-    observations = {}
-    while state.step < STEPS:
-        if planner.needs_sensing(state):
-            index, _ = planner.choose_sensing_action(state)
-            observations[state.step] = environment.perform_sensing(index)
-            state, _ = planner.observe(state, index, observations[state.step])
-        action, _ = planner.choose_task_action(state)
-        environment.perform(action)
-        state = planner.advance(state, action)
-    return observations
-
-
-class TestReplay:
-    @pytest.mark.parametrize("resampling_threshold", [1.0, 0.4])
-    def test_from_every_point_the_rest_is_the_same(
-        self, problem: Problem, resampling_threshold: float
-    ) -> None:
-        """After a crash at any point: read the checkpoint, see what was seen, decide the same."""
-        configured = planning_settings(resampling_threshold=resampling_threshold)
-        observations = observations_of(problem, configured)
-        start = Planner(problem, configured).init(SEED, TRIAL)
-        whole = list(go_on(problem, configured, start, observations, STEPS))
-        assert {decision.kind for decision in whole} == {"sense", "observe", "act", "advance"}
-        # With fewer resamplings, every other point.
-        for at in range(0, len(whole), 1 if resampling_threshold == 1.0 else 2):
-            state = whole[at].state
-            # The state in which a step senses, or acts: only there does the loop begin.
-            if whole[at].kind in {"observe", "advance"}:
-                continue
-            resumed = decode_checkpoint(encode_checkpoint(state))
-            fresh = type(problem).from_settings({}, {})  # type: ignore[attr-defined]
-            rest = list(go_on(fresh, configured, resumed, observations, STEPS))
-            assert [again[1:] for again in rest] == [first[1:] for first in whole[at:]]
-
-    def test_static_parameters_are_drawn_anew(self) -> None:
-        """And the same again, from a checkpoint: so says every service."""
-
-        class Landmark(Line):
-            def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
-                moved = states + actions + 0.1 * stream.normal(states.shape)
-                moved[..., 1] = states[..., 1]
-                return moved
-
-        class Named(Landmark):
-            static_parameters = (1,)
-
-        distinct, ends = [], []
-        for problem, at in ((Landmark(), 30), (Named(), 30), (Named(), 4)):
-            planner = Planner(problem, planning_settings())
-            state = planner.init(SEED, TRIAL)
-            for step in range(10):
-                if step == at:
-                    state = decode_checkpoint(encode_checkpoint(state))
-                state, _ = planner.observe(state, 1, np.array([0.5]))
-                state = planner.advance(state, np.array([0.1]))
-            values = state.belief.states[:, 1]
-            distinct.append((len(np.unique(values)), len(values)))
-            ends.append(planner.digest(state))
-        assert distinct[0][0] < 0.2 * distinct[0][1]
-        assert distinct[1][0] == distinct[1][1]
-        assert ends[0] != ends[1] == ends[2]
+    distinct, ends = [], []
+    for problem, at in ((Landmark(), 30), (Named(), 30), (Named(), 4)):
+        planner = Planner(problem, planning_settings())
+        state = planner.init(SEED, TRIAL)
+        for step in range(10):
+            if step == at:
+                state = decode_checkpoint(encode_checkpoint(state))
+            state, _ = planner.observe(state, 1, np.array([0.5]))
+            state = planner.advance(state, np.array([0.1]))
+        values = state.belief.states[:, 1]
+        distinct.append((len(np.unique(values)), len(values)))
+        ends.append(planner.digest(state))
+    assert distinct[0][0] < 0.2 * distinct[0][1]
+    assert distinct[1][0] == distinct[1][1]
+    assert ends[0] != ends[1] == ends[2]
 
 
 class TestPurity:
@@ -161,7 +85,8 @@ class TestPurity:
             array.setflags(write=False)
         before = digest(state)
 
-        planner.choose_sensing_action(state)
+        sensing_action, _ = planner.choose_sensing_action(state)
+        assert 0 <= sensing_action < len(problem.sensing_actions)
         after, _ = planner.observe(state, 0, observation)
         action, info = planner.choose_task_action(after)
         action.setflags(write=False)
@@ -232,23 +157,6 @@ class TestFunctions:
         # Of equals the first.
         _, info = planner.choose_task_action(state)
         assert info.estimate.tolist() == state.belief.states[0].tolist()
-
-
-class Broken(PegInHole2D):
-    """A peg whose functions return what they are told to."""
-
-    def __init__(self, **returned: FloatArray) -> None:
-        super().__init__()
-        self.returned = returned
-
-    def initial_states(self, stream: Stream, count: int) -> FloatArray:
-        return self.returned.get("initial_states", super().initial_states(stream, count))
-
-    def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
-        return self.returned.get("move", super().move(states, actions, stream))
-
-    def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
-        return self.returned.get("policy", super().policy(states, stage))
 
 
 class TestBadInput:
@@ -325,26 +233,22 @@ class TestBadInput:
             planner.advance(state, action)  # type: ignore[arg-type]
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf])
-    @pytest.mark.parametrize("function", ["initial_states", "move"])
-    def test_states_not_finite(self, peg: Problem, function: str, bad: float) -> None:
-        configured = planning_settings()
-        state = Planner(peg, configured).init(SEED, TRIAL)
+    @pytest.mark.parametrize("function", ["initial_states", "move", "policy"])
+    def test_what_a_problem_returns_is_finite(self, function: str, bad: float) -> None:
+        planner = Planner(PegInHole2D(), planning_settings())
+        state = planner.init(SEED, TRIAL)
         states = state.belief.states.copy()
         states[7, 1] = bad
-        broken = Broken(**{function: states})
-        planner = Planner(broken, configured)
-        with pytest.raises(ProblemError, match=rf"{function} of peg_in_hole_2d put particle 7 at"):
-            if function == "move":
-                planner.advance(state, np.zeros(3))
-            else:
-                planner.init(SEED, TRIAL)
-
-    @pytest.mark.parametrize("bad", [np.nan, np.inf])
-    def test_policy_not_finite(self, peg: Problem, bad: float) -> None:
-        state = Planner(peg, planning_settings()).init(SEED, TRIAL)
-        broken = Broken(policy=np.array([0.0, np.nan, bad]))
-        with pytest.raises(ProblemError, match="policy of peg_in_hole_2d gives"):
-            Planner(broken, planning_settings()).choose_task_action(state)
+        returned = np.array([0.0, np.nan, bad]) if function == "policy" else states
+        setattr(planner.problem, function, lambda *_: returned)
+        calls: dict[str, Callable[[], object]] = {
+            "initial_states": lambda: planner.init(SEED, TRIAL),
+            "move": lambda: planner.advance(state, np.zeros(3)),
+            "policy": lambda: planner.choose_task_action(state),
+        }
+        says = "gives" if function == "policy" else "put particle 7 at"
+        with pytest.raises(ProblemError, match=f"{function} of peg_in_hole_2d {says}"):
+            calls[function]()
 
     def test_the_last_step_of_all(self, peg: Problem) -> None:
         """Steps are words of 32 bits; the stream of the one after the last is refused."""

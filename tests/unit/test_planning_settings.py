@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,12 +12,7 @@ import pytest
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import (
-    ENTROPY_METHODS,
-    NEIGHBOR_ESTIMATORS,
-    UNINFORMED_METHODS,
     ActiveSensingSettings,
-    Estimator,
-    Method,
     PlanningSettings,
     SelectorSettings,
     check_settings,
@@ -105,9 +100,3 @@ def test_offsets_in_steps() -> None:
     assert path_steps(PlanningSettings(selector=offsets, sensing_interval=8)) == (0, 9, 27)
     in_steps = SelectorSettings(path_offsets=(0, 1, 3), path_unit="steps")
     assert path_steps(PlanningSettings(selector=in_steps, sensing_interval=8)) == (0, 1, 3)
-
-
-def test_the_sets_of_methods_and_estimators_are_some_of_all() -> None:
-    assert set(get_args(Method)) > ENTROPY_METHODS | UNINFORMED_METHODS
-    assert not ENTROPY_METHODS & UNINFORMED_METHODS
-    assert set(get_args(Estimator)) > NEIGHBOR_ESTIMATORS

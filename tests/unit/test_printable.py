@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from msgspec import structs
+from tests.command_line import Workplace
 
-from holdfast.cli import _print_defect, main
-from holdfast.cli.terminal import print_summary, progress_line
+from holdfast.cli import _print_defect
+from holdfast.cli.terminal import print_summary
 from holdfast.journal.tables import SummaryBuilder
 from holdfast.printable import brief, cell, one_line, printable
 from holdfast.protocol.messages import Refused, decode_reply, encode
 from holdfast.runtime.log_lines import json_line, text_line
-from holdfast.runtime.logs import EventLog
 from holdfast.transport.frames import read_goodbye
 
 HOSTILE = "\x1b[2J\x1b]0;title\x07\r\x9b1A\u202e\x7f"
@@ -71,6 +70,8 @@ def test_a_spreadsheet_runs_no_cell() -> None:
         assert cell(value) is value
 
 
+Run = Callable[..., str]
+
 PROBLEM = f"""
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
@@ -94,30 +95,14 @@ class Named(PegInHole2D):
 
 
 @pytest.fixture
-def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    (tmp_path / "hostile.py").write_text(PROBLEM)
-    yield tmp_path
-    sys.modules.pop("hostile", None)
-
-
-Run = Callable[..., str]
-
-
-@pytest.fixture
-def said(
-    workplace: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Run:
+def said(workplace: Workplace) -> Run:
     """Run a command that ends with an error, and return all that it shows."""
+    workplace.write("hostile.py", PROBLEM)
 
     def run(*arguments: str) -> str:
-        monkeypatch.setattr(sys, "argv", ["holdfast", *arguments])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        assert ended.value.code in (2, 4)
-        shown = capsys.readouterr()
-        return shown.out + shown.err
+        shown = workplace.run(*arguments)
+        assert shown.code in (2, 4)
+        return shown.stdout + shown.stderr
 
     return run
 
@@ -129,9 +114,9 @@ def require_harmless(shown: str) -> None:
 
 @pytest.mark.parametrize("mode", [[], ["--rate", "10000", "--log", "json"]])
 @pytest.mark.parametrize("name", ["Raises", "Refuses", "Named"])
-def test_a_user_s_problem(name: str, mode: list[str], workplace: Path, said: Run) -> None:
-    (workplace / "run.yaml").write_text(
-        f"problem: hostile:{name}\nparticle_filter: {{num_particles: 20}}\n"
+def test_a_user_s_problem(name: str, mode: list[str], workplace: Workplace, said: Run) -> None:
+    workplace.write(
+        "run.yaml", f"problem: hostile:{name}\nparticle_filter: {{num_particles: 20}}\n"
     )
     require_harmless(said("run", "run.yaml", "--out", "out", *mode))
 
@@ -147,9 +132,9 @@ def test_a_user_s_problem(name: str, mode: list[str], workplace: Path, said: Run
         'problem: peg_in_hole_2d\nenvironment: {{object: "{}"}}',
     ],
 )
-def test_a_configuration(text: str, workplace: Path, said: Run) -> None:
+def test_a_configuration(text: str, workplace: Workplace, said: Run) -> None:
     escaped = "".join(f"\\u{ord(letter):04x}" for letter in HOSTILE)
-    (workplace / "run.yaml").write_text(text.format(escaped))
+    workplace.write("run.yaml", text.format(escaped))
     require_harmless(said("run", "run.yaml"))
 
 
@@ -177,11 +162,6 @@ def test_a_defect_s_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == f"ValueError: {SEEN}\n"
 
 
-def test_progress(capsys: pytest.CaptureFixture[str]) -> None:
-    progress_line(3, quiet=False).say(HOSTILE)
-    assert capsys.readouterr().err == f"{SEEN}\n"
-
-
 def test_a_summary_is_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
     """Nothing of an address in brackets is left out."""
     empty = SummaryBuilder().build(problem="", seed=0, version="", trials=0, wall_time_s=0.0)
@@ -190,11 +170,3 @@ def test_a_summary_is_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
     shown = capsys.readouterr().out
     assert "tcp/[fe80::1]:7447 3" in shown
     require_harmless(shown)
-
-
-def test_a_line_of_json_keeps_its_meaning(tmp_path: Path) -> None:
-    with EventLog(tmp_path / "events", format="json", component="robot") as log:
-        log.event("note", reason=HOSTILE)
-    line = (tmp_path / "events").read_text()
-    require_harmless(line)
-    assert json.loads(line)["reason"] == HOSTILE

@@ -11,19 +11,9 @@ from tests.line_problem import SETTINGS, Line
 
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.planning.planner import Planner
+from holdfast.problems import problem
 from holdfast.problems.attributes import PARAMETERS, check_problem, resolution_of
-from holdfast.problems.problem import (
-    BatchedMotionProblem,
-    BatchedObservationProblem,
-    ExpectedMotionProblem,
-    FailingProblem,
-    GeneralObservationProblem,
-    KnownStateReturnProblem,
-    Problem,
-    ProblemBase,
-    ReinitialisedProblem,
-    ShownMovesProblem,
-)
+from holdfast.problems.problem import ProblemBase
 
 
 @pytest.mark.parametrize(
@@ -84,6 +74,9 @@ def test_an_attribute_is_named(attribute: str, value: object, message: str) -> N
         Planner(broken, SETTINGS).init(0, 0)
 
 
+EACH: dict[str, Any] = {"resolution": np.array([0.3]), "state_resolution": np.array([0.1, 0.2])}
+
+
 class TestResolution:
     """Which resolution the points have whose entropy counts."""
 
@@ -95,10 +88,26 @@ class TestResolution:
         found = resolution_of(problem, given, of_states=of_states)
         return found if isinstance(found, float) else found.tolist()
 
-    def test_one_number_is_for_actions_and_states(self) -> None:
-        for of_states in (False, True):
-            assert self.of(None, of_states=of_states, resolution=0.3) == 0.3
-            assert self.of(0.2, of_states=of_states, resolution=np.array([0.3])) == 0.2
+    @pytest.mark.parametrize(
+        ("given", "of_actions", "of_states", "own"),
+        [
+            (None, 0.3, 0.3, {"resolution": 0.3}),
+            (0.2, 0.2, 0.2, {"resolution": np.array([0.3])}),
+            (None, [0.3], [0.1, 0.2], EACH),
+            (None, [0.3], 0.4, {"resolution": (0.3,), "state_resolution": 0.4}),
+            # States of as many coordinates have the actions'.
+            (None, [0.3, 0.4], [0.3, 0.4], {"resolution": np.array([0.3, 0.4]), "action_size": 2}),
+        ],
+    )
+    def test_it_is_the_given_or_the_points_own(
+        self, given: float | None, of_actions: object, of_states: object, own: dict[str, Any]
+    ) -> None:
+        assert self.of(given, of_states=False, **own) == of_actions
+        assert self.of(given, of_states=True, **own) == of_states
+
+    def test_what_is_given_for_each_coordinate_comes_first(self) -> None:
+        assert self.of((0.5,), of_states=False, **EACH) == [0.5]
+        assert self.of((0.5, 0.6), of_states=True, **EACH) == [0.5, 0.6]
 
     @pytest.mark.parametrize("number", [np.float32(0.5), np.array(0.5), np.float64(0.5)])
     def test_a_number_of_numpy_is_one_number(self, number: Any) -> None:
@@ -115,21 +124,6 @@ class TestResolution:
     def test_what_is_no_number_is_named(self, name: str, own: object) -> None:
         with pytest.raises(ProblemError, match=f"^{name} of line is .*: must be numbers"):
             self.of(None, of_states=name == "state_resolution", **{name: own})
-
-    def test_what_is_given_comes_first(self) -> None:
-        own = {"resolution": np.array([0.3]), "state_resolution": np.array([0.1, 0.2])}
-        assert self.of((0.5,), of_states=False, **own) == [0.5]
-        assert self.of((0.5, 0.6), of_states=True, **own) == [0.5, 0.6]
-
-    def test_states_have_their_own(self) -> None:
-        own = {"resolution": np.array([0.3]), "state_resolution": np.array([0.1, 0.2])}
-        assert self.of(None, of_states=False, **own) == [0.3]
-        assert self.of(None, of_states=True, **own) == [0.1, 0.2]
-        assert self.of(None, of_states=True, resolution=(0.3,), state_resolution=0.4) == 0.4
-
-    def test_states_of_as_many_coordinates_have_the_actions(self) -> None:
-        found = self.of(None, of_states=True, resolution=np.array([0.3, 0.4]), action_size=2)
-        assert found == [0.3, 0.4]
 
     def test_states_of_another_number_of_coordinates_need_one(self) -> None:
         with pytest.raises(
@@ -175,17 +169,8 @@ def test_a_function_that_takes_something_else_is_named(
 
 
 def test_the_parameters_are_those_of_the_contract() -> None:
-    protocols = (
-        Problem,
-        GeneralObservationProblem,
-        ExpectedMotionProblem,
-        FailingProblem,
-        KnownStateReturnProblem,
-        BatchedMotionProblem,
-        BatchedObservationProblem,
-        ShownMovesProblem,
-        ReinitialisedProblem,
-    )
+    protocols = [kind for kind in vars(problem).values() if getattr(kind, "_is_protocol", False)]
+    assert problem.Problem in protocols
     members = {name: own for protocol in protocols for name, own in vars(protocol).items()}
     functions = {
         name: tuple(inspect.signature(member).parameters)[1:]

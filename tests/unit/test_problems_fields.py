@@ -2,104 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+import yaml
 
+from holdfast.config import registry
 from holdfast.errors import InvalidValueError
-from holdfast.problems.capsule_robot import CapsuleRobot
-from holdfast.problems.multitier_peg_in_hole_2d import MultitierPegInHole2D
 from holdfast.problems.peg_in_hole_2d import PegInHole2D, PegInHole2DModel
 
-# The sections of the files of the earlier work, whose keys must all be accepted.
-PEG_SETTINGS: tuple[dict[str, Any], dict[str, Any]] = (
-    {
-        "state_size": 3,
-        "peg_width": 1,
-        "peg_height": 2,
-        "hole_tolerance": 0.1,
-        "init_mean": [4, 2, 0],
-        "init_cov": [2, 1, 1.57],
-        "motion_cov": [0.01, 0.01, 0.01],
-        "sensing_cov": 0.001,
-        "collision_tol": 0.001,
-    },
-    {"translation_step_size": 0.1, "rotation_step_size": 0.1},
-)
+EARLIER_WORK = yaml.safe_load((Path(__file__).parent / "data" / "earlier_work.yaml").read_text())
 
 
-MULTITIER_SETTINGS: tuple[dict[str, Any], dict[str, Any]] = (
-    {
-        "peg_dim": [1, 2],
-        "map_dim": [-12, -12, 12, 12],
-        "init_mean": [0, 9, 0],
-        "init_cov": [2, 1, 1.57],
-        "init_seed": 0,
-        "motion_cov": [0.01, 0.01, 0.01],
-        "motion_seed": 0,
-        "sensing_cov": 0.001,
-        "sensing_seed": 0,
-        "collision_tol": 1e-3,
-        "holes": [
-            {"center": [4, 6], "tol": 0.1, "depth": 1.0},
-            {"center": [-4, 0], "tol": 0.1, "depth": 1.0},
-            {"center": [0, -6], "tol": 0.1, "depth": 1.0},
-        ],
-    },
-    {"translation_step_size": 0.1, "rotation_step_size": 0.1},
-)
-
-
-CAPSULE_SETTINGS: tuple[dict[str, Any], dict[str, Any]] = (
-    {
-        "robot_radius": 0.1,
-        "init_mean": [0.5, 2.5],
-        "init_cov": [0.01, 0.01],
-        "motion_cov": [1e-3, 1e-3],
-        "sensing_covs": [[1e-4, 1e-3], [1e-3, 1e-4]],
-        "collision_tol": 1e-3,
-        "seed": 0,
-        "num_walls": 6,
-        "walls": [
-            {"end_0": [0, 0], "end_1": [0, 3], "thickness": 0.1},
-            {"end_0": [0, 3], "end_1": [5, 3], "thickness": 0.1},
-            {"end_0": [5, 3], "end_1": [5, 0], "thickness": 0.1},
-            {"end_0": [5, 0], "end_1": [0, 0], "thickness": 0.1},
-            {"end_0": [0, 2], "end_1": [4, 2], "thickness": 0.1},
-            {"end_0": [1, 1], "end_1": [5, 1], "thickness": 0.1},
-        ],
-        "dt": 0.1,
-        "goal": {"center": [4.5, 0.5], "radius": 0.2, "axis": 0},
-    },
-    {
-        "gain_0": 1,
-        "gain_1": 1,
-        "num_via_points": 4,
-        "step_size": 0.1,
-        "via_points": [
-            {"center": [4.5, 2.5], "radius": 0.1, "axis": 0},
-            {"center": [4.5, 1.5], "radius": 0.1, "axis": 1},
-            {"center": [0.5, 1.5], "radius": 0.1, "axis": 0},
-            {"center": [0.5, 0.5], "radius": 0.1, "axis": 1},
-        ],
-    },
-)
-
-
-@pytest.mark.parametrize(
-    ("problem_class", "settings"),
-    [
-        (PegInHole2D, PEG_SETTINGS),
-        (MultitierPegInHole2D, MULTITIER_SETTINGS),
-        (CapsuleRobot, CAPSULE_SETTINGS),
-    ],
-)
-def test_the_earlier_works_settings_are_the_defaults(
-    problem_class: Any, settings: tuple[dict[str, Any], dict[str, Any]]
-) -> None:
-    loaded, default = problem_class.from_settings(*settings), problem_class()
+@pytest.mark.parametrize("name", EARLIER_WORK)
+def test_the_earlier_works_settings_are_the_defaults(name: str) -> None:
+    kind: Any = registry.problem_class(name)
+    loaded, default = kind.from_settings(*EARLIER_WORK[name].values()), kind()
     for section in ("model", "state_space_planner"):
         given = msgspec.to_builtins(getattr(loaded, section))
         expected = msgspec.to_builtins(getattr(default, section))

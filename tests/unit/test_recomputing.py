@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from tests.recordings import Journalling, configuration_of, record_trial
+from tests.recordings import Journalling, configuration_of, decided, flipped
 
 from holdfast.config.loader import Configuration
 from holdfast.errors import OutputError
@@ -18,35 +18,17 @@ from holdfast.journal.fingerprint import EarlierCode
 from holdfast.journal.run_directory import RunDirectory
 from holdfast.planning.inputs import ActingRecord, Record, Sensed
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.planner import Planner
 from holdfast.planning.settings import EnvironmentSettings
 from holdfast.robot import recomputing
 from holdfast.robot.recomputing import resume_run
-from holdfast.robot.trial import run_trial
 
 OLD = {"holdfast_version": "0.0.1", "holdfast_core": "0.0.1+abc"}
 
 
-def result_of(configuration: Configuration, trial: int) -> TrialResult:
-    result = record_trial(configuration, trial).record.result
-    assert result is not None
-    return result
-
-
 def records_of(configuration: Configuration, trial: int, count: int) -> list[Record]:
     journalling = Journalling()
-    planner = Planner(configuration.problem, configuration.planning)
-    run_trial(planner, configuration.simulator.seed, trial, observer=journalling, max_steps=30)
+    decided(configuration, trial, observer=journalling)
     return journalling.records[:count]
-
-
-def otherwise(result: TrialResult) -> TrialResult:
-    """Return a result with another first sensing action."""
-    assert result.decisions is not None
-    log = bytearray(result.decisions.log)
-    log[9] ^= 1
-    decisions = msgspec.structs.replace(result.decisions, log=bytes(log))
-    return msgspec.structs.replace(result, decisions=decisions, digest=decisions.digest())
 
 
 def begin(out: Path, configuration: Configuration, finished: Any, begun: Any = ()) -> None:
@@ -60,7 +42,7 @@ def begin(out: Path, configuration: Configuration, finished: Any, begun: Any = (
 
 def test_a_run_of_another_version_goes_on_and_says_who_decided_what(tmp_path: Path) -> None:
     configuration = configuration_of(tmp_path)
-    finished = [result_of(configuration, trial) for trial in (0, 1)]
+    finished = [decided(configuration, trial) for trial in (0, 1)]
     # Three decisions: a sensing action and two task actions, of which the last is pending.
     begin(tmp_path / "run", configuration, finished, records_of(configuration, 2, 4))
     told: list[tuple[int, int]] = []
@@ -73,7 +55,7 @@ def test_a_run_of_another_version_goes_on_and_says_who_decided_what(tmp_path: Pa
             "holdfast 0.0.1+abc decided trials 0 to 1 and the first 3 decisions of trial 2; "
             "this version decides the same (computed again: trials 0 to 2)"
         )
-        directory.add(result_of(configuration, 2))
+        directory.add(decided(configuration, 2))
         directory.write_tables(1.0)
         # The next version adds what this one has decided alone.
         directory.journal.set_meta(**OLD)
@@ -96,7 +78,7 @@ def test_of_many_finished_trials_few_are_computed(
     configuration = configuration_of(tmp_path)
     simulator = msgspec.structs.replace(configuration.simulator, num_trials=12)
     configuration = replace(configuration, simulator=simulator)
-    finished = [result_of(configuration, trial) for trial in (0, 1, 2, 5, 6, 9)]
+    finished = [decided(configuration, trial) for trial in (0, 1, 2, 5, 6, 9)]
     for seconds, computed in ((30.0, (0, 2, 9)), (-1.0, (0,))):
         monkeypatch.setattr(recomputing, "_FINISHED_S", seconds)
         out = tmp_path / f"run{computed}"
@@ -118,13 +100,13 @@ def test_nothing_decided_is_nothing_to_compute(tmp_path: Path) -> None:
 def test_another_decision_is_refused_and_named(tmp_path: Path) -> None:
     configuration = configuration_of(tmp_path)
     begun = records_of(configuration, 2, 7)
-    first = result_of(configuration, 0)
+    first = decided(configuration, 0)
     sensed, acting = begun[0], begun[5]
     assert isinstance(sensed, Sensed)
     assert isinstance(acting, ActingRecord)
     action = (np.frombuffer(acting.action) + 1e-16).tobytes()
     cases: dict[str, tuple[TrialResult, list[Record]]] = {
-        r"trial 0, step 0 \(the sensing action": (otherwise(first), begun),
+        r"trial 0, step 0 \(the sensing action": (flipped(first), begun),
         r"trial 2, step 2 \(the task action\)": (
             first,
             [*begun[:5], ActingRecord(acting.step, action)],
@@ -147,6 +129,6 @@ def test_a_run_without_observations_is_refused(tmp_path: Path) -> None:
     configuration = replace(
         configuration_of(tmp_path), environment=EnvironmentSettings(object="arm:Arm")
     )
-    begin(tmp_path / "run", configuration, [result_of(configuration, 0)])
+    begin(tmp_path / "run", configuration, [decided(configuration, 0)])
     with pytest.raises(OutputError, match=r"cannot be computed again: .*not kept its observations"):
         resume_run(tmp_path / "run", configuration)

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from tests.recordings import Journalling, configuration_of, record_trial
+from tests.recordings import Journalling, configuration_of, decided, record_trial
 from tests.trial_inputs import come_late, sense
 
 from holdfast.config.loader import Configuration
@@ -21,7 +21,7 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.reports.figure import trial_figure
 from holdfast.reports.recorder import Recorder
 from holdfast.robot.recomputing import run_recorded_trial
-from holdfast.robot.trial import NULL_OBSERVER, run_trial
+from holdfast.robot.trial import NULL_OBSERVER
 
 
 class TestRunRecordedTrial:
@@ -46,13 +46,7 @@ class TestRunRecordedTrial:
     @staticmethod
     def first(configuration: Configuration) -> tuple[list[Record], TrialResult]:
         journalling = Journalling()
-        result = run_trial(
-            Planner(configuration.problem, configuration.planning),
-            configuration.simulator.seed,
-            1,
-            max_steps=configuration.simulator.max_steps,
-            observer=journalling,
-        )
+        result = decided(configuration, observer=journalling)
         return journalling.records, result
 
     @pytest.mark.parametrize("max_steps", [20, 500])

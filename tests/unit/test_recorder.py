@@ -6,11 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.recordings import configuration_of, record_trial
+from tests.recordings import configuration_of, decided, record_trial
 
-from holdfast.planning.planner import Planner
 from holdfast.reports.recorder import MAX_PARTICLES_KEPT, Recorder
-from holdfast.robot.trial import run_trial
 
 
 class TestRecorder:
@@ -21,31 +19,15 @@ class TestRecorder:
         assert len(record.actions) == len(record.rewards) == steps
         # One more than steps: the states before the first and after each.
         assert len(record.true_states) == len(record.estimates) == steps + 1
+        assert len(np.unique(record.true_states, axis=0)) == steps + 1  # they are copies
         assert len(record.standard_deviations) == steps + 1
         assert sum(record.rewards) == pytest.approx(record.result.reward)
         assert [sensing.before.step for sensing in record.sensing] == list(range(0, steps, 9))
 
-    def test_the_choice_has_the_least_entropy(self, tmp_path: Path) -> None:
-        for sensing in record_trial(configuration_of(tmp_path)).record.sensing:
-            entropies = sensing.sensing_info.entropies
-            assert entropies is not None
-            assert sensing.sensing_action == int(np.argmin(entropies))
-
-    def test_it_keeps_copies(self, tmp_path: Path) -> None:
-        record = record_trial(configuration_of(tmp_path)).record
-        states = np.array(record.true_states)
-        assert len(np.unique(states, axis=0)) == len(states)
-
     def test_it_looks_away_from_other_trials(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)
         recorder = Recorder(trial=0)
-        run_trial(
-            Planner(configuration.problem, configuration.planning),
-            configuration.simulator.seed,
-            1,
-            max_steps=configuration.simulator.max_steps,
-            observer=recorder,
-        )
+        decided(configuration, observer=recorder)
         assert recorder.record.result is None
         assert not recorder.record.actions
 

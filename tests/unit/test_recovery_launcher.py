@@ -46,14 +46,6 @@ async def test_a_killed_service_is_reported_with_its_number(launcher: RecoveryLa
     assert await exits.next() == (3, "was ended by SIGKILL")
 
 
-async def test_a_signal_without_a_name_is_told_by_its_number(launcher: RecoveryLauncher) -> None:
-    exits = Exits()
-    launcher.launch(3, exits.put_nowait)
-    number = signal.SIGRTMIN + 6
-    os.kill(pid_of(launcher), number)
-    assert await exits.next() == (3, f"was ended by signal {number}")
-
-
 async def test_a_service_that_is_replaced_or_closed_is_not_reported(
     launcher: RecoveryLauncher,
 ) -> None:

@@ -5,24 +5,21 @@ from __future__ import annotations
 import json
 import math
 import struct
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-from tests.command_line import run_here
-from tests.programs import completed
+from tests import recordings
+from tests.command_line import Workplace
 
 from holdfast.errors import HoldfastError, OutputError
 from holdfast.journal.journal import Journal
 from holdfast.planning.inputs import ActingRecord, Sensed
 from holdfast.planning.outcome import DecisionLog, TrialResult
 from holdfast.reports.compare import Comparison, compare_runs
-
-COMMAND = [sys.executable, "-m", "holdfast"]
 
 CONFIGURATION = """\
 problem: peg_in_hole_2d
@@ -59,18 +56,13 @@ def result_of(
         log.acted(step, np.array(action))
     log.ended(len(steps), last)
     decisions = log.decisions()
-    return TrialResult(
-        trial=trial,
-        seed=5,
-        success=True,
+    return msgspec.structs.replace(
+        recordings.result_of(trial, reward=reward),
         steps=len(steps),
-        reward=reward,
-        sensing_decisions=sum(step[0] is not None for step in steps),
         mean_sensing_ms=float(trial),
         recoveries=trial,
-        unexplained_observations=0,
+        sensing_decisions=sum(step[0] is not None for step in steps),
         digest=decisions.digest(),
-        sensing_ms=(),
         decisions=decisions,
     )
 
@@ -101,19 +93,26 @@ def changed(step: int, what: Step) -> list[Step]:
     return [*STEPS[:step], what, *STEPS[step + 1 :]]
 
 
-class TestDecisions:
-    def compare(self, tmp_path: Path, second: TrialResult, trial: int = 1) -> Comparison:
-        same = [result_of(number) for number in range(trial)]
-        first = run_of(tmp_path / "first", [*same, result_of(trial)])
-        return compare_runs(first, run_of(tmp_path / "second", [*same, second]))
+def compared(
+    tmp_path: Path, first: Sequence[TrialResult], second: Sequence[TrialResult], **of_second: Any
+) -> Comparison:
+    one = run_of(tmp_path / "first", first)
+    return compare_runs(one, run_of(tmp_path / "second", second, **of_second))
 
+
+def difference_of(found: Comparison) -> tuple[object, ...]:
+    """Return what differs, of which trial and step, and how it is in both."""
+    assert found.difference is not None and not found.identical
+    return msgspec.structs.astuple(found.difference)
+
+
+class TestDecisions:
     def test_times_and_recoveries_do_not_matter(self, tmp_path: Path) -> None:
         first = run_of(tmp_path / "first", [result_of(0), result_of(1), result_of(2)])
         results = [result_of(trial) for trial in (2, 0, 1)]
         found = compare_runs(first, run_of(tmp_path / "second", results) / "journal.bin")
         assert found.identical
-        assert found.difference is None
-        assert found.notes == ()
+        assert (found.difference, found.notes) == (None, ())
         assert (found.trials, found.sensing_actions, found.task_actions) == (3, 6, 9)
         assert found.describe() == (
             "identical: 3 trials, 6 sensing actions, 9 task actions and every state digest"
@@ -151,52 +150,50 @@ class TestDecisions:
         self, tmp_path: Path, second: TrialResult | list[Step], difference: tuple[object, ...]
     ) -> None:
         other = second if isinstance(second, TrialResult) else result_of(1, second)
-        found = self.compare(tmp_path, other)
-        assert not found.identical
+        found = compared(tmp_path, [result_of(0), result_of(1)], [result_of(0), other])
         assert found.trials == 1
         what, step, first, last = difference
-        expected = {"what": what, "trial": 1, "step": step, "first": first, "second": last}
-        assert msgspec.to_builtins(found.difference) == expected
+        assert difference_of(found) == (what, 1, step, first, last)
 
     def test_numbers_that_print_alike_are_shown_by_their_bits(self, tmp_path: Path) -> None:
         assert math.isnan(NAN)
-        first = run_of(tmp_path / "first", [result_of(0, changed(1, (None, b"", (NAN, 1.0))))])
-        second = run_of(
-            tmp_path / "second", [result_of(0, changed(1, (None, b"", (OTHER_NAN, 1.0))))]
+        runs = [[result_of(0, changed(1, (None, b"", (nan, 1.0))))] for nan in (NAN, OTHER_NAN)]
+        assert difference_of(compared(tmp_path, *runs)) == (
+            *("task action[0]", 0, 1),
+            *("nan (0x7ff8000000000000)", "nan (0x7ff8000000000001)"),
         )
-        difference = compare_runs(first, second).difference
-        assert difference is not None
-        assert (difference.what, difference.step) == ("task action[0]", 1)
-        assert difference.first == "nan (0x7ff8000000000000)"
-        assert difference.second == "nan (0x7ff8000000000001)"
 
     def test_the_first_difference_is_told(self, tmp_path: Path) -> None:
-        first = run_of(tmp_path / "first", [result_of(trial) for trial in range(4)])
         other = result_of(2, changed(1, (None, b"", (0.2, 2.0))))
-        second = run_of(
-            tmp_path / "second", [result_of(0), result_of(1), other, result_of(3, STEPS[:1])]
+        found = compared(
+            tmp_path,
+            [result_of(trial) for trial in range(4)],
+            [result_of(0), result_of(1), other, result_of(3, STEPS[:1])],
         )
-        found = compare_runs(first, second)
         assert found.describe().splitlines() == [
             "different: trial 2, step 1, task action[1]",
-            f"  {first}:  1.0",
-            f"  {second}: 2.0",
+            f"  {tmp_path / 'first'}:  1.0",
+            f"  {tmp_path / 'second'}: 2.0",
         ]
 
-    def test_another_reward_is_noted(self, tmp_path: Path) -> None:
-        found = self.compare(tmp_path, result_of(1, reward=-2.0))
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            ({"reward": -2.0}, "outcome succeeded, reward -2.0"),
+            ({"success": False, "failed": True}, "outcome failed, reward -1.0"),
+        ],
+    )
+    def test_another_answer_of_the_world_is_noted(
+        self, tmp_path: Path, change: dict[str, Any], words: str
+    ) -> None:
+        found = compared(
+            tmp_path, [result_of(0)], [msgspec.structs.replace(result_of(0), **change)]
+        )
         assert found.identical
         assert found.notes == (
-            "the world answered otherwise: trial 1 has outcome succeeded, reward -1.0 in the first "
-            "run and outcome succeeded, reward -2.0 in the second",
+            "the world answered otherwise: trial 0 has outcome succeeded, reward -1.0 in the first "
+            f"run and {words} in the second",
         )
-
-    def test_another_outcome_is_noted(self, tmp_path: Path) -> None:
-        failed = msgspec.structs.replace(result_of(1), success=False, failed=True)
-        found = self.compare(tmp_path, failed)
-        assert found.identical
-        (note,) = found.notes
-        assert note.endswith("and outcome failed, reward -1.0 in the second")
 
 
 class TestRuns:
@@ -211,29 +208,27 @@ class TestRuns:
     def test_other_seeds_and_problems(
         self, tmp_path: Path, configuration: str, what: str, value: str
     ) -> None:
-        first = run_of(tmp_path / "first", [result_of(0)])
-        second = run_of(tmp_path / "second", [result_of(0)], configuration=configuration)
-        difference = compare_runs(first, second).difference
-        assert difference is not None
-        assert (difference.what, difference.second) == (what, value)
-        assert difference.trial is None
+        found = difference_of(
+            compared(tmp_path, [result_of(0)], [result_of(0)], configuration=configuration)
+        )
+        assert (found[0], found[1], found[-1]) == (what, None, value)
 
     def test_a_class_that_has_moved_since_is_the_same_problem(self, tmp_path: Path) -> None:
-        texts = [
-            CONFIGURATION.replace("peg_in_hole_2d", f"{module}.testbed.pegs:Peg")
-            for module in ("holdfast.lab", "holdfast_lab")
-        ]
         first, second = (
-            run_of(tmp_path / str(number), [result_of(0)], configuration=text)
-            for number, text in enumerate(texts)
+            run_of(
+                tmp_path / module,
+                [result_of(0)],
+                configuration=CONFIGURATION.replace("peg_in_hole_2d", f"{module}.testbed.pegs:Peg"),
+            )
+            for module in ("holdfast.lab", "holdfast_lab")
         )
         assert compare_runs(first, second).difference is None
 
     def test_other_versions_and_settings_are_noted(self, tmp_path: Path) -> None:
-        first = run_of(tmp_path / "first", [result_of(0)])
         other = CONFIGURATION.replace("0.1", "0.2").replace("400.0", "500.0")
-        second = run_of(tmp_path / "second", [result_of(0)], configuration=other, version="2.0")
-        found = compare_runs(first, second)
+        found = compared(
+            tmp_path, [result_of(0)], [result_of(0)], configuration=other, version="2.0"
+        )
         assert found.identical
         assert found.notes == (
             "made by holdfast 1.0 and by holdfast 2.0",
@@ -241,13 +236,11 @@ class TestRuns:
         )
 
     def test_a_trial_that_is_not_there(self, tmp_path: Path) -> None:
-        first = run_of(tmp_path / "first", [result_of(0), result_of(2)])
-        second = run_of(tmp_path / "second", [result_of(trial) for trial in range(3)])
-        difference = compare_runs(first, second).difference
-        assert difference is not None
-        assert (difference.what, difference.trial) == ("state of the trial", 1)
-        assert difference.first == "not in this run, which has 2 finished trials"
-        assert difference.second == "finished"
+        found = compared(
+            tmp_path, [result_of(0), result_of(2)], [result_of(trial) for trial in range(3)]
+        )
+        there = ("not in this run, which has 2 finished trials", "finished")
+        assert difference_of(found) == ("state of the trial", 1, None, *there)
 
     def test_an_unfinished_trial(self, tmp_path: Path) -> None:
         first = run_of(tmp_path / "first", [result_of(0), result_of(1)])
@@ -259,9 +252,7 @@ class TestRuns:
         ):
             found = compare_runs(one, other)
             assert found.trials == 1
-            assert found.difference is not None
-            assert found.difference.trial == 1
-            assert (found.difference.first, found.difference.second) == states
+            assert difference_of(found) == ("state of the trial", 1, None, *states)
 
     def test_a_trial_that_is_unfinished_in_both_runs(self, tmp_path: Path) -> None:
         """A killed run decided the same as itself, as far as it goes."""
@@ -271,10 +262,9 @@ class TestRuns:
         assert (found.trials, found.sensing_actions, found.task_actions) == (0, 1, 1)
         assert found.notes == ("trial 0 is unfinished in both runs: compared as far as it goes",)
         other = run_of(tmp_path / "other", [], unfinished=0, action=bytes(15) + b"\x3f")
-        difference = compare_runs(killed, other).difference
-        assert difference is not None
-        assert (difference.what, difference.trial, difference.step) == ("task action[1]", 0, 0)
-        assert difference.first != difference.second
+        *where, one, another = difference_of(compare_runs(killed, other))
+        assert where == ["task action[1]", 0, 0]
+        assert one != another
 
     def test_runs_without_a_trial_are_not_the_same(self, tmp_path: Path) -> None:
         found = compare_runs(run_of(tmp_path / "first", []), run_of(tmp_path / "second", []))
@@ -290,15 +280,13 @@ class TestRuns:
             with pytest.raises(HoldfastError, match="the configuration in a journal"):
                 compare_runs(run, run)
 
-    def test_a_record_forges_no_line(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_a_record_forges_no_line(self, tmp_path: Path, workplace: Workplace) -> None:
         forged = 'problem: "peg\\nidentical: 3 trials"\n'
         first = run_of(tmp_path / "first", [result_of(0)], configuration=forged)
         second = run_of(tmp_path / "second", [result_of(0)], version="1\nidentical: 3 trials")
         third = run_of(tmp_path / "third", [result_of(0)])
         for one, other in ((first, second), (second, third)):
-            said = run_here(capsys, tmp_path, "compare", str(one), str(other))
+            said = workplace.run("compare", str(one), str(other))
             lines = (said.stdout + said.stderr).splitlines()
             assert "identical: 3 trials" not in lines
 
@@ -325,30 +313,22 @@ class TestRuns:
 
 
 class TestCommand:
-    @staticmethod
-    def compare(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-        return completed([*COMMAND, "compare", *map(str, arguments)], timeout=60)
-
-    def test_identical(self, tmp_path: Path) -> None:
-        first = run_of(tmp_path / "first", [result_of(0)])
-        second = run_of(tmp_path / "second", [result_of(0)], version="2.0")
-        done = self.compare(first, second)
-        assert done.returncode == 0
-        assert done.stdout == (
-            "identical: 1 trial, 2 sensing actions, 3 task actions and every state digest\n"
+    def test_identical(self, tmp_path: Path, workplace: Workplace) -> None:
+        compared(tmp_path, [result_of(0)], [result_of(0)], version="2.0")
+        assert workplace.run("compare", "first", "second") == (
+            0,
+            "identical: 1 trial, 2 sensing actions, 3 task actions and every state digest\n",
+            "note: made by holdfast 1.0 and by holdfast 2.0\n",
         )
-        assert done.stderr == "note: made by holdfast 1.0 and by holdfast 2.0\n"
 
-    def test_different(self, tmp_path: Path) -> None:
-        first = run_of(tmp_path / "first", [result_of(0)])
-        second = run_of(tmp_path / "second", [result_of(0, STEPS[:2])])
-        done = self.compare(first, second)
-        assert (done.returncode, done.stderr) == (1, "")
-        assert done.stdout.startswith("different: trial 0, step 2, next decision\n")
-        done = self.compare(first, second, "--json")
-        assert done.returncode == 1
-        found = json.loads(done.stdout)
-        assert found["identical"] is False
+    def test_different(self, tmp_path: Path, workplace: Workplace) -> None:
+        compared(tmp_path, [result_of(0)], [result_of(0, STEPS[:2])])
+        said = workplace.run("compare", "first", "second")
+        assert (said.code, said.stderr) == (1, "")
+        assert said.stdout.startswith("different: trial 0, step 2, next decision\n")
+        said = workplace.run("compare", "first", "second", "--json")
+        found = json.loads(said.stdout)
+        assert (said.code, found["identical"]) == (1, False)
         assert found["difference"] == {
             "what": "next decision",
             "trial": 0,
@@ -357,7 +337,6 @@ class TestCommand:
             "second": "none, the trial ends",
         }
 
-    def test_what_cannot_be_read(self, tmp_path: Path) -> None:
-        done = self.compare(tmp_path, tmp_path / "missing")
-        assert (done.returncode, done.stdout) == (2, "")
-        assert done.stderr.startswith(f"holdfast: error: {tmp_path}: holds no journal.bin")
+    def test_what_cannot_be_read(self, workplace: Workplace) -> None:
+        said = workplace.fails("compare", ".", "missing")
+        assert said.startswith("holdfast: error: .: holds no journal.bin")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.command_line import run_here
-from tests.recordings import forget_steps, rewrite
+from tests.command_line import Workplace
+from tests.recordings import decided, forget_steps, rewrite
 
 import holdfast as hf
 from holdfast.errors import OutputError
@@ -56,13 +56,14 @@ class Seen(TrialObserver):
 
 
 @pytest.fixture
-def recorded(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Recorded:
+def recorded(workplace: Workplace) -> Recorded:
     def run(text: str = CONFIGURATION) -> RunArrays:
-        (tmp_path / "run.yaml").write_text(text)
+        workplace.write("run.yaml", text)
         module = "from holdfast_lab.simulation.peg_with_encoders import PegWithEncoders\n"
-        (tmp_path / "encoders.py").write_text(module)
-        assert run_here(capsys, tmp_path, "run", "run.yaml", "--out", "run", "-q").code in (0, 1)
-        return hf.open_run(tmp_path / "run", problem_directory=tmp_path)
+        workplace.write("encoders.py", module)
+        assert workplace.run("run", "run.yaml", "--out", "run", "-q").code in (0, 1)
+        directory = workplace.directory
+        return hf.open_run(directory / "run", problem_directory=directory)
 
     return run
 
@@ -72,16 +73,9 @@ def test_the_arrays_are_what_was_run(recorded: Recorded, problem: str) -> None:
     run = recorded(CONFIGURATION.replace("peg_in_hole_2d", problem))
     configuration = run.configuration
     assert run.trials == (0, 1, 2)
-    planner = hf.Planner(configuration.problem, configuration.planning)
     for number, trial in enumerate(run.read()):
         seen = Seen()
-        result = hf.run_trial(
-            planner,
-            configuration.simulator.seed,
-            number,
-            max_steps=configuration.simulator.max_steps,
-            observer=seen,
-        )
+        result = decided(configuration, number, observer=seen)
         assert trial.result is not None
         assert trial.result.digest == result.digest == run.results["digest"][number]
         assert run.results["steps"][number] == result.steps == len(trial.task_actions)

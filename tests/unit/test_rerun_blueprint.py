@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -11,12 +10,6 @@ from holdfast.config.loader import load
 from holdfast.reports.rerun_blueprint import drawn_layout, is_flat
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-@pytest.fixture(autouse=True)
-def own_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the examples' directory, which their problems need, to no other test."""
-    monkeypatch.setattr(sys, "path", sys.path.copy())
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
@@ -31,12 +30,6 @@ from holdfast.reports.view_target import ViewTarget
 from holdfast.robot.trial import LateStep
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-@pytest.fixture(autouse=True)
-def own_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the examples' directory, which their problems need, to no other test."""
-    monkeypatch.setattr(sys, "path", sys.path.copy())
 
 
 DECIDER = Timing(0, 0, "task", "tcp/10.0.0.7:7447", "local_recovery", 1.0, 2.0, 3.0)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -110,11 +108,3 @@ def test_the_alerts_watch_what_is_told() -> None:
     watched = set(re.findall(r"\bholdfast_robot_\w+", RULES.read_text(encoding="utf-8")))
     assert len(watched) == 6
     assert watched <= {name for name, _ in told(RobotMetrics(), world_of())}
-
-
-def test_the_package_is_not_imported_before_it_is_used() -> None:
-    program = "import sys, holdfast.robot.metrics; print('prometheus_client' in sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "False\n"

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from unittest.mock import AsyncMock, Mock
 
 import pytest
-from tests.recordings import robot_configuration
+from tests.recordings import decided, robot_configuration
 from tests.unit.test_runtime_events import RecordingSink
 
 from holdfast.config.loader import Configuration
@@ -40,9 +39,8 @@ from holdfast.protocol.status import Status
 from holdfast.robot import own_planner
 from holdfast.robot import process as robot_process
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
-from holdfast.robot.links import Links, make_links
+from holdfast.robot.links import make_links
 from holdfast.robot.process import RobotProcess
-from holdfast.robot.trial import run_trial
 from holdfast.runtime.events import BoundedEventLog
 
 PATIENCE_S = 30.0
@@ -57,27 +55,21 @@ def configuration(tmp_path: Path) -> Configuration:
 class Robots(RecordingSink):
     """Makes robots that go on in one directory, and keeps what they say."""
 
-    def __init__(self, configuration: Configuration, path: Path) -> None:
+    def __init__(self, configuration: Configuration, directory: RunDirectory) -> None:
         super().__init__()
-        self.configuration = configuration
-        self.links: Links | None = None
+        self.configuration, self.directory = configuration, directory
+
         self.results: list[TrialResult] = []
         self.on_timing: Callable[[Timing], None] = lambda _: None
-        self.path = path
         self.maker = load_environment(configuration)
         self.on_order: Callable[[PlanningState, Act | Sense], None] | None = None
 
-    @functools.cached_property
-    def directory(self) -> RunDirectory:
-        """The run's; it belongs to the thread that asks for it first."""
-        return RunDirectory.create(self.path, self.configuration)
-
     def make(self) -> RobotProcess:
         configuration = self.configuration
-        self.links = make_links(configuration, None, BoundedEventLog())
+        links = make_links(configuration, None, BoundedEventLog())
         return RobotProcess(
             configuration,
-            self.links,
+            links,
             self.directory.journal,
             self.maker,
             self,
@@ -101,22 +93,14 @@ class Robots(RecordingSink):
 
 @pytest.fixture
 def robots(configuration: Configuration, tmp_path: Path) -> Iterator[Robots]:
-    robots = Robots(configuration, tmp_path / "run")
-    yield robots
-    if "directory" in vars(robots):
-        robots.directory.close()
+    with RunDirectory.create(tmp_path / "run", configuration) as directory:
+        yield Robots(configuration, directory)
 
 
 def plain_digests(configuration: Configuration) -> list[str]:
     """Return what a loop without journal, wire and service decides."""
     return [
-        run_trial(
-            Planner(configuration.problem, configuration.planning),
-            configuration.simulator.seed,
-            trial,
-            max_steps=configuration.simulator.max_steps,
-        ).digest
-        for trial in range(configuration.simulator.num_trials)
+        decided(configuration, trial).digest for trial in range(configuration.simulator.num_trials)
     ]
 
 
@@ -168,26 +152,10 @@ class Clock:
         self.ahead_s += seconds
 
 
-class NoWire:
-    """A transport over which nothing comes."""
-
-    def start(self, deliver: Callable[[TransportEvent], None]) -> None:
-        pass
-
-    def call(self, service: str, call: int, payload: bytes) -> None:
-        pass
-
-    def abandon(self, call: int) -> None:
-        pass
-
-    async def close(self, timeout_s: float = 1.0) -> None:
-        pass
-
-
 def scripted(robots: Robots, begin: Callable[[], object]) -> tuple[RobotProcess, Machine]:
     """Return a robot whose machine is a script, which begins with something of the test's own."""
     robot, machine = robots.make(), Machine()
-    robot._transport = NoWire()
+    robot._transport = Mock(close=AsyncMock())  # over which nothing comes
     robot.robot = machine  # type: ignore[assignment]
     robot._begin_next = begin  # type: ignore[method-assign, assignment]
     return robot, machine
@@ -195,17 +163,6 @@ def scripted(robots: Robots, begin: Callable[[], object]) -> tuple[RobotProcess,
 
 def test_it_decides_as_a_plain_loop_does(robots: Robots) -> None:
     robots.run()
-    assert robots.digests == plain_digests(robots.configuration)
-
-
-def test_it_runs_on_a_thread_that_is_not_the_main_one(robots: Robots) -> None:
-    def run() -> None:
-        robots.run()
-        vars(robots).pop("directory").close()
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    thread.join(PATIENCE_S)
     assert robots.digests == plain_digests(robots.configuration)
 
 
@@ -248,30 +205,20 @@ def test_the_loop_looks_at_the_wire_before_it_handles_more_than_some_events(
 
 
 def test_what_comes_while_all_is_closed_ends_nothing_too_early(robots: Robots) -> None:
-    class SlowWire(NoWire):
-        is_closed = False
+    closed: list[bool] = []
 
-        async def close(self, timeout_s: float = 1.0) -> None:
-            robot._happens(RecoveryExited(2, "while the wire is closed"))
-            robot._on_loop().call_soon(robot._end)
-            await asyncio.sleep(0.01)
-            self.is_closed = True
+    async def close(timeout_s: float = 1.0) -> None:
+        robot._happens(RecoveryExited(2, "while the wire is closed"))
+        robot._on_loop().call_soon(robot._end)
+        await asyncio.sleep(0.01)
+        closed.append(True)
 
     robot, machine = scripted(robots, lambda: robot._happens(RecoveryExited(1, "ended")))
-    robot._transport = wire = SlowWire()
+    robot._transport = Mock(close=close)
     machine.answers = [[Paused()]]
     robot.run(())
-    assert wire.is_closed
+    assert closed == [True]
     assert machine.trace == ["handle RecoveryExited"]
-
-
-def test_the_machine_is_woken_when_it_asks_for_it(robots: Robots) -> None:
-    robot, machine = scripted(robots, lambda: None)
-    now = time.monotonic()
-    machine.wakeups = [now + 0.05, now + 0.01]  # it asks for an earlier time later on
-    machine.answers = [[], [Paused()]]
-    robot.run(())
-    assert machine.trace == ["wake", "wake"]
 
 
 def test_an_earlier_time_replaces_a_later_one(robots: Robots) -> None:
@@ -399,22 +346,6 @@ def test_what_its_own_planner_refuses_is_said_and_ends_the_run(
     assert ("stopped", {"reason": "policy gives nan"}) in robots.events
 
 
-def test_a_problem_that_fails_is_named_with_the_step(
-    robots: Robots, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real = EnvironmentMaker.__call__
-
-    def make(*arguments: Any, **options: Any) -> Any:
-        environment = real(*arguments, **options)
-        monkeypatch.setattr(type(environment), "perform", lambda *_: "no reward")
-        return environment
-
-    monkeypatch.setattr(EnvironmentMaker, "__call__", make)
-    with pytest.raises(Exception, match="trial 0, step 0") as raised:
-        robots.run()
-    assert not isinstance(raised.value, TrialError)
-
-
 class TestSignals:
     @pytest.fixture(autouse=True)
     def _handlers(self) -> Iterator[None]:
@@ -496,51 +427,19 @@ def test_what_takes_long_is_computed_on_a_thread_while_the_robot_goes_on(
 class TestPause:
     """What a process does that has something else on its main thread."""
 
-    def test_before_it_runs(self, robots: Robots) -> None:
-        robot = robots.make()
-        robot.pause(PATIENCE_S)
-        robot.run(())
-        assert robots.results == []
-        robots.run()
-        assert robots.digests == plain_digests(robots.configuration)
-
-    def test_in_the_middle_of_a_trial(self, robots: Robots) -> None:
-        robot = robots.make()
-        decisions = 0
-
-        def count(_: Timing) -> None:
-            nonlocal decisions
-            decisions += 1
-            if decisions == 5:
-                threading.Thread(target=robot.pause, args=(PATIENCE_S,)).start()
-
-        robots.on_timing = count
-        robot.run(())
-        unfinished = robots.directory.journal.unfinished()
-        if unfinished is not None:  # else the trial has ended meanwhile
-            assert isinstance(unfinished.records[-1], PausedRecord)
-        assert robot.condition().word == "ending"
-        robots.on_timing = lambda _: None
-        robots.run()
-        assert robots.digests == plain_digests(robots.configuration)
-
     def test_an_environment_that_does_not_return_is_left_alone(self, robots: Robots) -> None:
         called, let_go = threading.Event(), threading.Event()
 
-        class Stuck:
-            def perform_sensing(self, sensing_action: int) -> list[float]:
-                called.set()
-                let_go.wait(PATIENCE_S)
-                return [0.0]
+        def stuck(sensing_action: int) -> list[float]:
+            called.set()
+            let_go.wait(PATIENCE_S)
+            return [0.0]
 
-            def perform(self, task_action: object) -> None:
-                raise NotImplementedError
-
-            def is_done(self) -> bool:
-                return False
+        def world() -> Mock:
+            return Mock(perform_sensing=stuck, is_done=lambda: False)
 
         problem = robots.configuration.problem
-        robots.maker = EnvironmentMaker("stuck", problem, 0, 60_000.0, Stuck)
+        robots.maker = EnvironmentMaker("stuck", problem, 0, 60_000.0, world)  # type: ignore[arg-type]
         robot = robots.make()
 
         def pause() -> None:

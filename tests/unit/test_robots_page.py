@@ -3,31 +3,20 @@
 from __future__ import annotations
 
 import re
-import sys
 import textwrap
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.recordings import decided
 
 from holdfast.config.loader import load
 from holdfast.config.user_code import find_class
 from holdfast.errors import ConfigurationError
-from holdfast.planning.planner import Planner
-from holdfast.robot.trial import run_trial
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "docking.py"
 PAGE = (ROOT / "docs" / "robots.md").read_text(encoding="utf-8")
-
-
-@pytest.fixture(autouse=True)
-def forgotten_imports(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Other tests have modules of the example's name."""
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    yield
-    sys.modules.pop("docking", None)
 
 
 def test_what_it_quotes_stands_in_an_example() -> None:
@@ -47,12 +36,9 @@ def outcomes(name: str, trials: int) -> list[str]:
         search_directory=EXAMPLE.parent,
         error_type=ConfigurationError,
     )
-    planner = Planner(configuration.problem, configuration.planning)
     seed = configuration.simulator.seed
-    steps = configuration.simulator.max_steps
     results = [
-        run_trial(planner, seed, trial, max_steps=steps, environment=robot(seed, trial))
-        for trial in range(trials)
+        decided(configuration, trial, environment=robot(seed, trial)) for trial in range(trials)
     ]
     assert all(result.failed == bool(result.reason) for result in results)
     return [result.outcome for result in results]

@@ -86,6 +86,19 @@ async def hanging_up(reader: asyncio.StreamReader, writer: asyncio.StreamWriter)
     await reader.read(1)
 
 
+NONSENSE = {
+    "hangs up": hanging_up,
+    "another protocol": saying(b"SSH-2.0-OpenSSH\r\n\r\n"),
+    "not found": saying(b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n"),
+    "too long": saying(b"HTTP/1.1 200 OK\r\nContent-Length: 1000000000000\r\n\r\n"),
+    "negative length": saying(b"HTTP/1.1 200 OK\r\nContent-Length: -1\r\n\r\n"),
+    "no length": saying(b"HTTP/1.1 200 OK\r\nContent-Length: many\r\n\r\n"),
+    "broken": saying(b"HTTP/1.1 200 OK\r\nContent-Length: 3\r\n\r\n<a>"),
+    "no answer": saying(b"HTTP/1.1 200 OK\r\nContent-Length: 4\r\n\r\n<a/>"),
+    "no head": saying(b"\xff" * 1_000_000),
+}
+
+
 class TestCalls:
     async def test_several_over_one_connection(self) -> None:
         handler, asked = answering([1, "", 42], [1, "", ["x"]])
@@ -142,31 +155,7 @@ class TestCalls:
             with pytest.raises(SilentError, match=r"getPid: no answer within 0\.05 s"):
                 await call(f"http://127.0.0.1:{port}/", "getPid", within_s=SHORT_S)
 
-    @pytest.mark.parametrize(
-        "handler",
-        [
-            hanging_up,
-            saying(b"SSH-2.0-OpenSSH\r\n\r\n"),
-            saying(b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n"),
-            saying(b"HTTP/1.1 200 OK\r\nContent-Length: 1000000000000\r\n\r\n"),
-            saying(b"HTTP/1.1 200 OK\r\nContent-Length: -1\r\n\r\n"),
-            saying(b"HTTP/1.1 200 OK\r\nContent-Length: many\r\n\r\n"),
-            saying(b"HTTP/1.1 200 OK\r\nContent-Length: 3\r\n\r\n<a>"),
-            saying(b"HTTP/1.1 200 OK\r\nContent-Length: 4\r\n\r\n<a/>"),
-            saying(b"\xff" * 1_000_000),
-        ],
-        ids=[
-            "hangs up",
-            "another protocol",
-            "not found",
-            "too long",
-            "negative length",
-            "no length",
-            "broken",
-            "no answer",
-            "no head",
-        ],
-    )
+    @pytest.mark.parametrize("handler", NONSENSE.values(), ids=NONSENSE)
     async def test_nonsense(self, handler: Handler) -> None:
         async with listening(handler) as (port, _):
             with pytest.raises(CallError) as raised:

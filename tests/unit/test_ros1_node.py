@@ -10,7 +10,7 @@ import struct
 import threading
 import warnings
 import xmlrpc.client
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any, cast
 
 import pytest
@@ -130,6 +130,35 @@ def around(master: Master) -> RosEnvironment:
     return RosEnvironment(f"http://127.0.0.1:{master.port}", "127.0.0.1", "127.0.0.1", "/")
 
 
+@contextlib.asynccontextmanager
+async def running(master: Master, start_s: float = 0.0, **more: Any) -> AsyncIterator[RosNode]:
+    """Run a node that offers a service."""
+    node = RosNode("cloud", around(master), **more)
+    node.offer("cloud", TYPE, echo)
+    await node.start(start_s)
+    yield node
+    await node.close()
+
+
+@contextlib.asynccontextmanager
+async def client(
+    at: tuple[str, int],
+) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    reader, writer = await asyncio.open_connection(*at)
+    async with asyncio.timeout(PATIENCE_S):
+        yield reader, writer
+    writer.close()
+
+
+def post(content: bytes) -> bytes:
+    return f"POST / HTTP/1.1\r\nContent-Length: {len(content)}\r\n\r\n".encode() + content
+
+
+def place_of(node: RosNode) -> tuple[str, int]:
+    host, port = node._uri.removeprefix("http://").rstrip("/").split(":")
+    return host, int(port)
+
+
 async def until(true: Callable[[], object]) -> None:
     async with asyncio.timeout(PATIENCE_S):
         while not true():
@@ -146,36 +175,25 @@ class TestTheMasterLies:
         self, master: Master, said: bytes
     ) -> None:
         told: list[str] = []
-        node = RosNode(
-            "cloud", around(master), on_event=lambda _, **fields: told.append(fields["status"])
-        )
-        node.offer("cloud", TYPE, echo)
         master.says = lambda _: said
-        await node.start(0.0)
-        await until(lambda: len(master.asked) > 2)
-        master.says = master.knows
-        await until(lambda: "/cloud" in master.services)
-        # Now it is asked whether it knows the node, and lies again.
-        await until(lambda: told[-1:] == ["registered"])
-        before = len(master.asked)
-        master.says = lambda _: said
-        await until(lambda: len(master.asked) > before + 1)
-        master.services.clear()
-        master.says = master.knows
-        await until(lambda: "/cloud" in master.services)
+        async with running(master, on_event=lambda _, **fields: told.append(fields["status"])):
+            await until(lambda: len(master.asked) > 2)
+            master.says = master.knows
+            await until(lambda: "/cloud" in master.services)
+            # Now it is asked whether it knows the node, and lies again.
+            await until(lambda: told[-1:] == ["registered"])
+            before = len(master.asked)
+            master.says = lambda _: said
+            await until(lambda: len(master.asked) > before + 1)
+            master.services.clear()
+            master.says = master.knows
+            await until(lambda: "/cloud" in master.services)
         assert told[:2] == ["unreachable", "registered"]
-        await node.close()
 
     async def test_a_defect_of_ours_ends_nothing(
         self, master: Master, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         told: list[tuple[str, str]] = []
-        node = RosNode(
-            "cloud",
-            around(master),
-            on_event=lambda _, **fields: told.append((fields["status"], fields["reason"])),
-        )
-        node.offer("cloud", TYPE, echo)
         call, fails = Connection.call, True
 
         async def failing(self: Connection, *arguments: Any, **more: Any) -> Any:
@@ -185,12 +203,15 @@ class TestTheMasterLies:
 
         monkeypatch.setattr(Connection, "call", failing)
         monkeypatch.setattr(ros1_node, "_CHECK_INTERVAL_S", 0.01)
-        await node.start(0.1)
-        fails = False
-        await until(lambda: "/cloud" in master.services)
+
+        def note(_: str, **fields: str) -> None:
+            told.append((fields["status"], fields["reason"]))
+
+        async with running(master, 0.1, on_event=note):
+            fails = False
+            await until(lambda: "/cloud" in master.services)
         assert told[0] == ("unreachable", "KeyError: 'x'")
         assert [status for status, _ in told][:2] == ["unreachable", "registered"]
-        await node.close()
 
 
 @pytest.mark.parametrize(
@@ -207,29 +228,14 @@ class TestTheMasterLies:
 async def test_what_is_no_question_to_a_node_is_answered_with_a_fault(
     master: Master, content: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
-    node = RosNode("cloud", around(master))
-    node.publish("topic", RosType("std_msgs/String", "0" * 32, "string data"))
-    await node.start(0.0)
-    host, port = node._uri.removeprefix("http://").rstrip("/").split(":")
-    reader, writer = await asyncio.open_connection(host, int(port))
-    for _ in range(2):  # on the same connection
-        size = str(len(content)).encode()
-        writer.write(b"POST / HTTP/1.1\r\nContent-Length: " + size + b"\r\n\r\n" + content)
-        head = await asyncio.wait_for(HttpHead.read(reader), PATIENCE_S)
-        with pytest.raises(xmlrpc.client.Fault):
-            xmlrpc.client.loads(await reader.readexactly(head.size))
-    writer.close()
-    await node.close()
+    async with running(master) as node, client(place_of(node)) as (reader, writer):
+        node.publish("topic", RosType("std_msgs/String", "0" * 32, "string data"))
+        for _ in range(2):  # on the same connection
+            writer.write(post(content))
+            head = await HttpHead.read(reader)
+            with pytest.raises(xmlrpc.client.Fault):
+                xmlrpc.client.loads(await reader.readexactly(head.size))
     assert not caplog.records
-
-
-def post(content: bytes) -> bytes:
-    return f"POST / HTTP/1.1\r\nContent-Length: {len(content)}\r\n\r\n".encode() + content
-
-
-def place_of(node: RosNode) -> tuple[str, int]:
-    host, port = node._uri.removeprefix("http://").rstrip("/").split(":")
-    return host, int(port)
 
 
 async def test_calls_of_many_hold_up_nobody_else(
@@ -249,10 +255,8 @@ async def test_calls_of_many_hold_up_nobody_else(
             turn += 1
             await asyncio.sleep(0)
 
-    node = RosNode("cloud", around(master))
-    await node.start(0.0)
     content = xmlrpc.client.dumps(("/x",), "getPid").encode()
-    async with asyncio.timeout(PATIENCE_S):
+    async with asyncio.timeout(PATIENCE_S), running(master) as node:
         streams = [await asyncio.open_connection(*place_of(node)) for _ in range(20)]
         monkeypatch.setattr(node, "_answer", note)
         for _, writer in streams:
@@ -263,36 +267,27 @@ async def test_calls_of_many_hold_up_nobody_else(
             assert b"<int>" in await reader.readexactly(head.size)
             writer.close()
     assert len(set(parsed)) == len(parsed)
-    await node.close()
 
 
 async def test_a_call_with_a_document_type_is_not_expanded(master: Master) -> None:
     """A few hundred bytes of nested entities took a second of the loop's thread."""
-    node = RosNode("cloud", around(master))
-    await node.start(0.0)
-    reader, writer = await asyncio.open_connection(*place_of(node))
     document = (
         '<?xml version="1.0"?><!DOCTYPE m [<!ENTITY a "getPid">]>'
         "<methodCall><methodName>&a;</methodName><params></params></methodCall>"
     )
-    for encoding in ("utf-8", "utf-16"):
-        writer.write(post(document.encode(encoding)))
-        head = await asyncio.wait_for(HttpHead.read(reader), PATIENCE_S)
-        with pytest.raises(xmlrpc.client.Fault, match="document type"):
-            xmlrpc.client.loads(await reader.readexactly(head.size))
-    writer.close()
-    await node.close()
+    async with running(master) as node, client(place_of(node)) as (reader, writer):
+        for encoding in ("utf-8", "utf-16"):
+            writer.write(post(document.encode(encoding)))
+            head = await HttpHead.read(reader)
+            with pytest.raises(xmlrpc.client.Fault, match="document type"):
+                xmlrpc.client.loads(await reader.readexactly(head.size))
 
 
 async def test_a_call_larger_than_any_of_ros_is_not_read(master: Master) -> None:
-    node = RosNode("cloud", around(master))
-    await node.start(0.0)
-    reader, writer = await asyncio.open_connection(*place_of(node))
-    with contextlib.suppress(ConnectionError):
-        writer.write(post(b"<a/>" * 4096))
-        assert await asyncio.wait_for(reader.read(), PATIENCE_S) == b""
-    writer.close()
-    await node.close()
+    async with running(master) as node, client(place_of(node)) as (reader, writer):
+        with contextlib.suppress(ConnectionError):
+            writer.write(post(b"<a/>" * 4096))
+            assert await reader.read() == b""
 
 
 @pytest.mark.parametrize("turns", range(8))
@@ -333,34 +328,21 @@ def test_what_waits_for_a_subscriber_has_a_bound() -> None:
     assert 64 << 10 <= deaf.waiting <= (64 << 10) + 10_004
 
 
-def address_of(node: RosNode) -> tuple[str, int]:
-    return "127.0.0.1", node._port
-
-
-def header(**more: str) -> bytes:
-    return encode_header({"service": "/cloud", "md5sum": "*", "callerid": "/x", **more})
-
-
 async def test_half_a_request_holds_no_place_for_ever(
     master: Master, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ros1_node, "_REQUEST_S", 0.05)
-    node = RosNode("cloud", around(master))
-    node.offer("cloud", TYPE, echo)
-    await node.start(0.0)
-    for half in (struct.pack("<I", 100) + b"x", b"\1"):
-        reader, writer = await asyncio.open_connection(*address_of(node))
-        writer.write(header(persistent="1") + half)
-        async with asyncio.timeout(PATIENCE_S):
-            await reader.read()
-        writer.close()
-    # Who has begun none may wait.
-    reader, writer = await asyncio.open_connection(*address_of(node))
-    writer.write(header(persistent="1"))
-    async with asyncio.timeout(PATIENCE_S):
-        await reader.readexactly(int.from_bytes(await reader.readexactly(4), "little"))
-        await asyncio.sleep(0.2)
-        writer.write(struct.pack("<I", 2) + b"ab")
-        assert await reader.readexactly(7) == b"\1" + struct.pack("<I", 2) + b"ab"
-    writer.close()
-    await node.close()
+    fields = {"service": "/cloud", "md5sum": "*", "callerid": "/x", "persistent": "1"}
+    async with running(master) as node:
+        address = ("127.0.0.1", node._port)
+        for half in (struct.pack("<I", 100) + b"x", b"\1"):
+            async with client(address) as (reader, writer):
+                writer.write(encode_header(fields) + half)
+                await reader.read()
+        # Who has begun none may wait.
+        async with client(address) as (reader, writer):
+            writer.write(encode_header(fields))
+            await reader.readexactly(int.from_bytes(await reader.readexactly(4), "little"))
+            await asyncio.sleep(0.2)
+            writer.write(struct.pack("<I", 2) + b"ab")
+            assert await reader.readexactly(7) == b"\1" + struct.pack("<I", 2) + b"ab"

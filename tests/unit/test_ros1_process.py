@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.command_line import run_here
+from tests.command_line import Workplace
 
 from holdfast_ros import messages
 
@@ -24,35 +24,24 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
     ],
 )
 def test_it_says_why(
-    arguments: list[str],
-    text: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str], text: str, workplace: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ROS_HOSTNAME", "127.0.0.1")
-    said = run_here(capsys, tmp_path, "ros1-serve", *arguments)
-    assert (said.code, said.stdout) == (2, "")
-    assert said.stderr.startswith("holdfast: error: ")
-    assert text in said.stderr
+    assert text in workplace.fails("ros1-serve", *arguments)
 
 
 def test_an_address_that_others_reach_is_refused(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    workplace: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("ROS_IP", "192.0.2.1")
     monkeypatch.delenv("ROS_HOSTNAME", raising=False)
-    said = run_here(capsys, tmp_path, "ros1-serve", "--configuration", str(EXAMPLE))
-    assert said.code == 2
-    assert "no peer proves its identity" in said.stderr
+    said = workplace.fails("ros1-serve", "--configuration", str(EXAMPLE))
+    assert "no peer proves its identity" in said
 
 
-def test_it_says_what_it_lacks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_says_what_it_lacks(workplace: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
     messages.typestore.cache_clear()
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     monkeypatch.setenv("ROS_HOSTNAME", "127.0.0.1")
-    said = run_here(capsys, tmp_path, "ros1-serve", "--configuration", str(EXAMPLE))
-    assert (said.code, said.stdout) == (2, "")
-    assert "ROS messages need rosbags: pip install rosbags" in said.stderr
+    said = workplace.fails("ros1-serve", "--configuration", str(EXAMPLE))
+    assert "ROS messages need rosbags: pip install rosbags" in said

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import pytest
-from tests.command_line import run_here
+from tests.command_line import Workplace
 
 
-def test_it_has_the_options_of_serve(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    said = run_here(capsys, tmp_path, "ros1-serve", "--help")
-    assert said.code == 0
+def test_it_has_the_options_of_serve(workplace: Workplace) -> None:
+    said = workplace.runs("ros1-serve", "--help")
     assert "--listen ENDPOINT" in said.stdout
     assert "--ros1-name NAME" in said.stdout

@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.recordings import decided
 
 from holdfast.config.loader import Configuration, load
 from holdfast.errors import InvalidValueError, TransportError
 from holdfast.planning.inputs import ActingRecord, Sensed, decode_floats
-from holdfast.planning.planner import Planner
 from holdfast.protocol.status import Status
 from holdfast.robot.environment import Environment, SimulatedEnvironment
-from holdfast.robot.trial import run_trial
 from holdfast_ros.active_sensing import (
     ActiveSensing,
     DecisionAnswer,
@@ -48,6 +47,12 @@ class Direct:
         if self.fails:
             raise TransportError("connection refused")
         return self._answers.answer(request)
+
+
+def two_services(kind: type[Any] = Direct) -> list[Any]:
+    """Return the cloud's and the recovery service."""
+    answers = ActiveSensing(configuration())
+    return [kind(name, answers) for name in ("cloud", "recovery")]
 
 
 def client_of(cloud: Direct, recovery: Direct, *more: Any) -> ActiveSensingClient:
@@ -85,12 +90,7 @@ def decisions(
 
 
 def in_process(configuration: Configuration, trial: int) -> list[int | tuple[float, ...]]:
-    result = run_trial(
-        Planner(configuration.problem, configuration.planning),
-        configuration.simulator.seed,
-        trial,
-        max_steps=configuration.simulator.max_steps,
-    )
+    result = decided(configuration, trial)
     made: list[int | tuple[float, ...]] = []
     assert result.decisions is not None
     for decision in result.decisions:
@@ -128,15 +128,13 @@ def test_a_trial_decides_as_in_process_whoever_is_lost(interval: int) -> None:
 
 
 def test_a_service_that_never_answers_holds_nobody_longer_than_the_deadline() -> None:
-    settings = configuration()
-
     class Stopped(Direct):
         async def ask(self, request: DecisionRequest, deadline_s: float) -> DecisionAnswer:
             await asyncio.Event().wait()
             raise AssertionError
 
-    cloud = Stopped("cloud", ActiveSensing(settings))
-    client = client_of(cloud, Direct("recovery", ActiveSensing(settings)), 0.01)
+    _, recovery = two_services()
+    client = client_of(Stopped("cloud", ActiveSensing(configuration())), recovery, 0.01)
     answer = client.decide(DecisionRequest(RequestKind.INITIALIZE, seed=1, trial=0))
     assert answer.error is ErrorCode.OK
     assert client.decided_by == "recovery"
@@ -145,8 +143,7 @@ def test_a_service_that_never_answers_holds_nobody_longer_than_the_deadline() ->
 
 
 def test_nobody_answers() -> None:
-    settings = configuration()
-    cloud, recovery = (Direct(name, ActiveSensing(settings)) for name in ("cloud", "recovery"))
+    cloud, recovery = two_services()
     cloud.fails = recovery.fails = True
     told: list[str] = []
     with (
@@ -158,8 +155,7 @@ def test_nobody_answers() -> None:
 
 
 def test_an_error_of_the_request_is_raised_and_not_asked_again_elsewhere() -> None:
-    settings = configuration()
-    cloud, recovery = (Direct(name, ActiveSensing(settings)) for name in ("cloud", "recovery"))
+    cloud, recovery = two_services()
     with (
         client_of(cloud, recovery) as client,
         pytest.raises(InvalidValueError, match="cloud: BAD_REQUEST: kind 9"),
@@ -182,8 +178,7 @@ class Slow(Direct):
 
 
 def test_a_recovery_service_that_is_slower_than_the_deadline_gets_more_time() -> None:
-    settings = configuration()
-    cloud, recovery = (Slow(name, ActiveSensing(settings)) for name in ("cloud", "recovery"))
+    cloud, recovery = two_services(Slow)
     cloud.fails, cloud.takes_s, recovery.takes_s = True, 60.0, 0.05
     with client_of(cloud, recovery, 0.01) as client:
         for _ in range(2):
@@ -193,8 +188,7 @@ def test_a_recovery_service_that_is_slower_than_the_deadline_gets_more_time() ->
 
 
 def test_who_waits_for_a_client_that_is_closed_is_told_so() -> None:
-    settings = configuration()
-    cloud, recovery = (Direct(name, ActiveSensing(settings)) for name in ("cloud", "recovery"))
+    cloud, recovery = two_services()
     cloud.fails = recovery.fails = True
     holding = threading.Event()
     client = client_of(cloud, recovery, 0.01, lambda *_, **__: holding.set())

@@ -6,9 +6,8 @@ import ast
 import json
 from pathlib import Path
 
-import pytest
 from rosbags.highlevel import AnyReader
-from tests.command_line import run_here
+from tests.command_line import Workplace
 
 ROOT = Path(__file__).parents[2]
 
@@ -32,16 +31,11 @@ def test_the_method_shown_is_the_examples() -> None:
     assert {"perform_sensing", "perform", "is_done", "steps_performed"} <= example.keys()
 
 
-def test_the_layouts_show_all_that_is_exported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_layouts_show_all_that_is_exported(workplace: Workplace) -> None:
     example = str(ROOT / "examples" / "peg_in_hole_2d.yaml")
-    for words in (
-        ("run", example, "--trials", "1", "--out", "run", "-q"),
-        ("export", "run", "--mcap", "run.mcap", "-q"),
-    ):
-        assert run_here(capsys, tmp_path, *words).code == 0
-    with AnyReader([tmp_path / "run.mcap"]) as reader:
+    workplace.runs("run", example, "--trials", "1", "--out", "run", "-q")
+    workplace.runs("export", "run", "--mcap", "run.mcap", "-q")
+    with AnyReader([workplace.directory / "run.mcap"]) as reader:
         kinds = {each.topic: each.msgtype.partition("/")[0] for each in reader.connections}
     layouts = ROOT / "ros" / "holdfast_bringup"
     rviz = (layouts / "rviz" / "holdfast.rviz").read_text(encoding="utf-8")

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from tests.command_line import Said, run_here
+from tests.command_line import PEG, Workplace
 from tests.recordings import forget_steps, rewrite
 
 from holdfast.errors import HeldError
@@ -21,61 +21,11 @@ from holdfast.journal import journal_file
 from holdfast.journal.journal_file import Notes
 from holdfast.robot.process import RobotProcess
 
-PEG = """
-problem: peg_in_hole_2d
-particle_filter: {num_particles: 40}
-active_sensing: {num_observation_samples: 3, num_cores: 1}
-simulator: {num_trials: 6, max_steps: 80, seed: 3}
-"""
-
-
-class Workplace:
-    """A directory in which commands are run."""
-
-    def __init__(self, directory: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        self.directory = directory
-        self._capsys = capsys
-        self.write("peg.yaml", PEG)
-
-    def write(self, name: str, text: str) -> None:
-        (self.directory / name).write_text(text)
-
-    def names(self) -> set[str]:
-        return {path.name for path in self.directory.iterdir()} - {"__pycache__"}
-
-    def run(self, *arguments: str, figures: bool = False) -> Said:
-        return run_here(self._capsys, self.directory, *arguments, figures=figures)
-
-    def runs(self, *arguments: str, figures: bool = False) -> Said:
-        """Run a command that is to come to its end; return what it says."""
-        said = self.run(*arguments, figures=figures)
-        assert said.code == 0, said
-        return said
-
-    def decided(self, out: str) -> list[tuple[str, ...]]:
-        """Return the table of trials, without the times."""
-        with (self.directory / out / "trials.csv").open() as file:
-            return [
-                tuple(value for key, value in row.items() if key != "mean_sensing_ms")
-                for row in csv.DictReader(file)
-            ]
-
-    def summary(self, out: str) -> dict[str, object]:
-        found: dict[str, object] = json.loads((self.directory / out / "summary.json").read_text())
-        return found
-
-    def fails(self, *arguments: str) -> str:
-        """Run a command that is to be refused; return what it says."""
-        said = self.run(*arguments)
-        assert (said.code, said.stdout) == (2, "")
-        assert said.stderr.startswith("holdfast: error: ")
-        assert "Traceback" not in said.stderr
-        return said.stderr
-
 
 @pytest.fixture
-def workplace(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Workplace:
-    return Workplace(tmp_path, capsys)
+def workplace(workplace: Workplace) -> Workplace:
+    workplace.write("peg.yaml", PEG)
+    return workplace
 
 
 def test_the_resolved_configuration_runs_again_to_the_same(workplace: Workplace) -> None:
@@ -88,28 +38,10 @@ def test_the_resolved_configuration_runs_again_to_the_same(workplace: Workplace)
     assert workplace.summary("second")["seed"] == 8
 
 
-def test_without_matplotlib_there_is_no_figure_but_all_else(workplace: Workplace) -> None:
-    said = workplace.runs("run", "peg.yaml", "--trials", "1", "--out", "out")
-    assert "pip install matplotlib" in said.stderr
-    assert not (workplace.directory / "out" / "trial.png").exists()
-    assert (workplace.directory / "out" / "summary.json").exists()
-
-
-def test_a_run_can_be_extended(workplace: Workplace) -> None:
-    arguments = ("run", "peg.yaml", "--jobs", "1", "--out")
-    workplace.runs(*arguments, "out", "--trials", "2")
-    said = workplace.runs(*arguments, "out", "--trials", "5", "--resume")
-    assert "2 finished before" in said.stderr
-    workplace.runs(*arguments, "whole", "--trials", "5")
-    assert workplace.decided("out") == workplace.decided("whole")
-    out, whole = (workplace.directory / name / "config.yaml" for name in ("out", "whole"))
-    assert out.read_text() == whole.read_text()
-
-
 class TestResumeIfBegun:
     ARGUMENTS = ("run", "peg.yaml", "--jobs", "1", "--out", "out", "--resume-if-begun")
 
-    def test_it_begins_goes_on_and_has_ended(self, workplace: Workplace) -> None:
+    def test_it_begins_is_extended_and_has_ended(self, workplace: Workplace) -> None:
         (workplace.directory / "out").mkdir()  # as a volume is that was just mounted
         workplace.runs(*self.ARGUMENTS, "--trials", "2")
         said = workplace.runs(*self.ARGUMENTS, "--trials", "5")
@@ -122,6 +54,8 @@ class TestResumeIfBegun:
         assert {path: path.stat().st_mtime_ns for path in tables} == tables
         workplace.runs("run", "peg.yaml", "--jobs", "1", "--out", "whole", "--trials", "5")
         assert workplace.decided("out") == workplace.decided("whole")
+        whole = workplace.directory / "whole" / "config.yaml"
+        assert (out / "config.yaml").read_text() == whole.read_text()
 
     def test_tables_that_are_missing_or_old_are_made(self, workplace: Workplace) -> None:
         workplace.runs(*self.ARGUMENTS, "--trials", "2")
@@ -293,7 +227,6 @@ def test_a_figure_that_a_problem_fails_to_describe(
     assert workplace.summary("out")["finished"] == 6
 
 
-@pytest.mark.parametrize("error", [KeyError("a")])
 @pytest.mark.parametrize(
     ("function", "says"),
     [
@@ -303,17 +236,14 @@ def test_a_figure_that_a_problem_fails_to_describe(
     ],
 )
 def test_what_a_finished_run_can_do_without_may_fail(
-    workplace: Workplace,
-    monkeypatch: pytest.MonkeyPatch,
-    function: str,
-    says: str,
-    error: BaseException,
+    workplace: Workplace, monkeypatch: pytest.MonkeyPatch, function: str, says: str
 ) -> None:
     def fail(*_: object) -> None:
-        raise error
+        raise KeyError("a")
 
     monkeypatch.setattr(function, fail)
-    said = workplace.runs("run", "peg.yaml", "--out", "out", "--trials", "1", figures=True)
+    words = ("run", "peg.yaml", "--out", "out", "--trials", "1")
+    said = workplace.runs(*words, figures=function.endswith("trial_figure"))
     assert f"note: no {says}" in said.stderr
     assert workplace.summary("out")["finished"] == 1
 
@@ -338,7 +268,7 @@ def test_a_problem_is_no_file(workplace: Workplace) -> None:
 def test_what_is_nearly_a_file_is_suggested(workplace: Workplace) -> None:
     assert workplace.fails("run", "pegg.yaml").endswith("no such file; did you mean peg.yaml?\n")
     assert "'problem: lamps:Room' is enough" in workplace.fails("run", "lamps:Room")
-    (workplace.directory / "lamps.py").write_text("")
+    workplace.write("lamps.py", "")
     error = workplace.fails("run", "lamps.py")
     assert "lamps.py: is Python; lamps:CLASS is a problem, and a run needs" in error
 
@@ -361,13 +291,8 @@ class Licensed(PegInHole2D):
 def test_a_constructor_that_fails_in_what_is_resumed_ends_with_the_command(
     command: list[str], workplace: Workplace
 ) -> None:
-    (workplace.directory / "licensed.py").write_text(LICENSED)
-    text = (
-        (workplace.directory / "peg.yaml")
-        .read_text()
-        .replace("peg_in_hole_2d", "licensed:Licensed")
-    )
-    (workplace.directory / "own.yaml").write_text(text)
+    workplace.write("licensed.py", LICENSED)
+    workplace.write("own.yaml", PEG.replace("peg_in_hole_2d", "licensed:Licensed"))
     licence = workplace.directory / "licence"
     name, *options = command
     words = [name, "own.yaml", *options, "--out", "out"]
@@ -393,47 +318,27 @@ def test_too_few_particles_are_noted(workplace: Workplace) -> None:
     assert "take more particles (particle_filter.num_particles)" in " ".join(said.stdout.split())
 
 
+MY_ROBOT = ("--environment", "my_robot:MyRobot")
+
+
 @pytest.mark.parametrize(
-    ("name", "text", "expected"),
+    ("options", "text", "expected"),
     [
-        ("my_robot:Robot", "class MyRobot: pass\n", "did you mean MyRobot?"),
-        ("my_robt:MyRobot", "class MyRobot: pass\n", "No module named 'my_robt'"),
-        ("my_robot:MyRobot", "import math\nmath.sqrt(-1)\n", 'my_robot.py", line 2'),
-        ("my_robot:MyRobot", "import sys\nsys.exit(0)\n", "raised SystemExit: 0"),
+        (("-e", "my_robot:Robot"), "class MyRobot: pass\n", "did you mean MyRobot?"),
+        (("-e", "my_robt:MyRobot"), "class MyRobot: pass\n", "No module named 'my_robt'"),
+        (MY_ROBOT, "import math\nmath.sqrt(-1)\n", 'my_robot.py", line 2'),
+        (MY_ROBOT, "import sys\nsys.exit(0)\n", "raised SystemExit: 0"),
+        (("--service", "tls/a:7", "--tls", "nowhere"), "", "nowhere/authority.pem: cannot be read"),
+        (("--service", "tls/127.0.0.1:7"), "", "tls needs credentials"),
     ],
 )
 @pytest.mark.parametrize("out", [("--out", "out"), ()])
-def test_an_environment_that_is_not_there_claims_no_directory(
-    workplace: Workplace, name: str, text: str, expected: str, out: tuple[str, ...]
+def test_what_is_not_there_claims_no_directory(
+    workplace: Workplace, options: tuple[str, ...], text: str, expected: str, out: tuple[str, ...]
 ) -> None:
     workplace.write("my_robot.py", text)
-    assert expected in workplace.fails("run", "peg.yaml", "--environment", name, *out)
+    assert expected in workplace.fails("run", "peg.yaml", *options, *out)
     assert workplace.names() == {"peg.yaml", "my_robot.py"}
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (("--tls", "nowhere"), "nowhere/authority.pem: cannot be read"),
-        ((), "tls needs credentials"),
-    ],
-)
-def test_credentials_that_are_not_there_claim_no_directory(
-    workplace: Workplace, options: tuple[str, ...], expected: str
-) -> None:
-    arguments = ("peg.yaml", "--service", "tls/127.0.0.1:7", "--out", "out", *options)
-    assert expected in workplace.fails("run", *arguments)
-    assert workplace.names() == {"peg.yaml"}
-
-
-def test_a_service_in_the_file_that_cannot_be_one_is_named_with_its_key(
-    workplace: Workplace,
-) -> None:
-    services = "[tcp/127.0.0.1:7447, quic/10.0.0.7:7447]"
-    workplace.write("old.yaml", f"{PEG}\noffload: {{services: {services}}}\n")
-    error = workplace.fails("run", "old.yaml", "--out", "out")
-    assert "old.yaml: offload.services[1]: endpoint 'quic/10.0.0.7:7447'" in error
-    assert workplace.names() == {"peg.yaml", "old.yaml"}
 
 
 @pytest.mark.parametrize(
@@ -469,11 +374,6 @@ def test_a_problem_whose_class_is_not_named(workplace: Workplace) -> None:
     )
     said = workplace.fails("run", "peg.yaml", "--out", "out", "--problem", "held_problem")
     assert "did you mean held_problem:Held?" in said
-
-
-def test_a_configuration_without_a_command(workplace: Workplace) -> None:
-    error = workplace.fails("peg.yaml", "--jobs", "2")
-    assert error.endswith("did you mean: holdfast run peg.yaml --jobs 2\n")
 
 
 class TestAfterAReboot:

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
 import pytest
-from tests.command_line import run_here
-from tests.recordings import configuration_of, record_trial
+from tests.command_line import PEG, Workplace
+from tests.recordings import configuration_of, decided, flipped
 
 from holdfast.cli.run_figure import repeat, service_that_decided
 from holdfast.errors import DecidedOtherwiseError
@@ -22,33 +21,12 @@ from holdfast.protocol.question import OWN_PLANNER
 from holdfast.protocol.robot_events import Timing
 from holdfast.reports.recorder import Recorder
 
-PEG = """
-problem: peg_in_hole_2d
-particle_filter: {num_particles: 40}
-active_sensing: {num_observation_samples: 3, num_cores: 1}
-simulator: {num_trials: 1, max_steps: 60, seed: 3}
-"""
 
-
-def test_a_figure_of_this_run_and_of_an_earlier_one(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    (tmp_path / "peg.yaml").write_text(PEG)
-    command = ["run", "peg.yaml", "--jobs", "1", "--out", "out"]
-    assert run_here(capsys, tmp_path, *command, figures=True).code == 0
-    figure = tmp_path / "out" / "trial.png"
-    assert figure.read_bytes().startswith(b"\x89PNG\r\n")
-    figure.unlink()
-    again = run_here(capsys, tmp_path, *command, "--trials", "2", "--resume", figures=True)
-    assert (again.code, "figure" in again.stderr) == (0, False)
-    assert figure.read_bytes().startswith(b"\x89PNG\r\n")
-
-
-def test_the_figure_of_any_trial_in_three_formats(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    (tmp_path / "peg.yaml").write_text(PEG.replace("num_trials: 1", "num_trials: 3"))
-    assert run_here(capsys, tmp_path, "run", "peg.yaml", "--jobs", "1", "--out", "out").code == 0
+def test_the_figure_of_any_trial_in_three_formats(workplace: Workplace) -> None:
+    workplace.write("peg.yaml", PEG)
+    assert (
+        workplace.run("run", "peg.yaml", "--jobs", "1", "--trials", "3", "--out", "out").code == 0
+    )
     drawn = {}
     for name, trials, beginning in (
         ("one.pdf", "1", b"%PDF"),
@@ -59,35 +37,27 @@ def test_the_figure_of_any_trial_in_three_formats(
         ("two.svg", "2", b"<?xml"),
     ):
         words = ["export", "out", "--figure", name, "--trials", trials]
-        said = run_here(capsys, tmp_path, *words, figures=True)
+        said = workplace.run(*words, figures=True)
         assert (said.code, name in said.stdout) == (0, True), said.stderr
-        drawn[name] = (tmp_path / name).read_bytes()
+        drawn[name] = (workplace.directory / name).read_bytes()
         assert drawn[name].startswith(beginning)
     for kind in ("svg", "pdf"):  # the first of the trials, whenever it is drawn
         assert drawn[f"one.{kind}"] == drawn[f"again.{kind}"]
     assert drawn["one.svg"] != drawn["two.svg"]
     for words, message in (
         (["--figure", "new.png"], "matplotlib is not installed"),
-        (["--figure", "one.png"], "one.png: exists already; remove it"),
+        (["--figure", "one.pdf"], "one.pdf: exists already; remove it"),
         (["--figure", "x.svg", "--csv", "x.svg"], "x.svg is given twice; give two places"),
     ):
-        said = run_here(capsys, tmp_path, "export", "out", *words, figures="new.png" not in words)
+        said = workplace.run("export", "out", *words, figures="new.png" not in words)
         assert (said.code, message in said.stderr) == (2, True), said.stderr
 
 
-def test_without_matplotlib_a_note_says_so(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    (tmp_path / "peg.yaml").write_text(PEG)
-    said = run_here(capsys, tmp_path, "run", "peg.yaml", "--out", "out")
+def test_without_matplotlib_a_note_says_so(workplace: Workplace) -> None:
+    workplace.write("peg.yaml", PEG)
+    said = workplace.run("run", "peg.yaml", "--trials", "1", "--out", "out")
     assert said.code == 0
     assert "note: no figure, because matplotlib is not installed" in said.stderr
-
-
-def result_of(tmp_path: Path) -> TrialResult:
-    result = record_trial(configuration_of(tmp_path)).record.result
-    assert result is not None
-    return result
 
 
 def repeated(tmp_path: Path, result: TrialResult) -> tuple[int, str | None] | None:
@@ -104,7 +74,7 @@ def repeated(tmp_path: Path, result: TrialResult) -> tuple[int, str | None] | No
 
 
 def test_the_same_trial_has_no_deviation(tmp_path: Path) -> None:
-    assert repeated(tmp_path, result_of(tmp_path)) is None
+    assert repeated(tmp_path, decided(configuration_of(tmp_path))) is None
 
 
 @pytest.mark.parametrize(
@@ -119,12 +89,7 @@ def test_the_same_trial_has_no_deviation(tmp_path: Path) -> None:
 def test_the_first_deviation_is_found(
     byte: int, differs: tuple[int, str | None], tmp_path: Path
 ) -> None:
-    result = result_of(tmp_path)
-    assert result.decisions is not None
-    log = bytearray(result.decisions.log)
-    log[byte] ^= 1
-    kept = msgspec.structs.replace(result.decisions, log=bytes(log))
-    assert repeated(tmp_path, msgspec.structs.replace(result, decisions=kept)) == differs
+    assert repeated(tmp_path, flipped(decided(configuration_of(tmp_path)), byte)) == differs
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import msgspec
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from tests.programs import said_by
 
 from holdfast import __version__
 from holdfast.protocol.messages import PROTOCOL_VERSION
@@ -141,13 +142,6 @@ class TestAddingUp:
         assert (left.sessions, left.state_bytes, left.waiting, left.running, left.calls) == (0,) * 5
         assert statistics.sessions == 3
 
-    def test_over_a_wire(self) -> None:
-        times = DecisionTimes()
-        times.add("sensing", 0.1, 0.2)
-        report = ServiceReport(ServiceStatistics(refusals={"version": 3}), times)
-        again = msgspec.msgpack.decode(msgspec.msgpack.encode(report), type=ServiceReport)
-        assert again == report
-
 
 def test_without_the_package_the_error_says_how_to_get_it() -> None:
     program = (
@@ -157,15 +151,10 @@ def test_without_the_package_the_error_says_how_to_get_it() -> None:
         "try:\n    require_prometheus()\n"
         "except MetricsError as error:\n    print(error)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert "pip install prometheus-client" in done.stdout
+    assert "pip install prometheus-client" in said_by(program)
 
 
 def test_the_package_is_not_imported_before_it_is_used() -> None:
-    program = "import sys, holdfast.service.metrics; print('prometheus_client' in sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "False\n"
+    modules = "sys, holdfast.service.metrics, holdfast.robot.metrics"
+    program = f"import {modules}; print('prometheus_client' in sys.modules)"
+    assert said_by(program) == "False\n"

@@ -37,7 +37,6 @@ from holdfast.protocol.robot_events import (
     CallEnded,
     ReplyReceived,
     ServiceAppeared,
-    ServiceVanished,
     TransportEvent,
 )
 from holdfast.protocol.service import Service
@@ -96,6 +95,32 @@ class Patient:
             assert content(await self.ask(next_request(robot))) == robot.right_answer()
             robot.act_until_sensing()
             robot.sense()
+
+
+class Call:
+    """A call that notes what it is told."""
+
+    on_gone: Callable[[], object] | None = None
+
+    def __init__(self, trace: list[str], robot: str = "a robot", payload: bytes = b"") -> None:
+        self.trace, self.robot, self.payload = trace, robot, payload
+        self.replies: list[bytes] = []
+        self.ended = asyncio.Event()
+
+    def reply(self, payload: bytes, *, last: bool = False) -> None:
+        self.replies.append(payload)
+        self.trace.append(f"{'last' if last else 'reply'} {payload.decode(errors='replace')}")
+        if last:
+            self.ended.set()
+
+    def end(self) -> None:
+        self.trace.append("end")
+        self.ended.set()
+
+    async def answer(self) -> Reply:
+        async with asyncio.timeout(PATIENCE_S):
+            await self.ended.wait()
+        return decode_reply(self.replies[-1])
 
 
 class Held(CapsuleRobot):
@@ -244,14 +269,9 @@ async def test_calls_are_heard_while_all_workers_compute() -> None:
             assert isinstance(replies[-1], SensingAnswer)
 
 
-@pytest.mark.parametrize(
-    ("bound", "value"),
-    [("_MAX_UNDECODED", 2), ("_MAX_UNDECODED_BYTES", int(2.5 * len(LARGE)))],
-)
-async def test_large_requests_beyond_the_bound_are_turned_away_unread(
-    bound: str, value: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(shell, bound, value)
+@pytest.fixture
+def let_go(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """Return what large requests wait for, to be decoded."""
     let_go = threading.Event()
 
     def decode(payload: bytes) -> Request:
@@ -260,6 +280,17 @@ async def test_large_requests_beyond_the_bound_are_turned_away_unread(
         return decode_request(payload)
 
     monkeypatch.setattr(shell, "decode_request", decode)
+    return let_go
+
+
+@pytest.mark.parametrize(
+    ("bound", "value"),
+    [("_MAX_UNDECODED", 2), ("_MAX_UNDECODED_BYTES", int(2.5 * len(LARGE)))],
+)
+async def test_large_requests_beyond_the_bound_are_turned_away_unread(
+    bound: str, value: int, let_go: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shell, bound, value)
     async with joined() as both:
         patient = Patient(both.network)
         kept = {patient.send(LARGE), patient.send(LARGE)}
@@ -283,45 +314,13 @@ async def test_large_requests_beyond_the_bound_are_turned_away_unread(
         assert both.log.events[0][0] == "busy"
 
 
-class LargeCall:
-    """A large request of a robot with a certificate."""
-
-    payload = LARGE
-    on_gone: Callable[[], object] | None = None
-
-    def __init__(self, robot: str) -> None:
-        self.robot = robot
-        self.replies: list[bytes] = []
-        self.ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-
-    def reply(self, payload: bytes, *, last: bool = False) -> None:
-        self.replies.append(payload)
-        if last:
-            self.end()
-
-    def end(self) -> None:
-        self.ended.set_result(None)
-
-    async def answer(self) -> Reply:
-        async with asyncio.timeout(PATIENCE_S):
-            await self.ended
-        return decode_reply(self.replies[-1])
-
-
 async def test_one_robot_takes_no_room_for_large_requests_from_another(
-    monkeypatch: pytest.MonkeyPatch,
+    let_go: threading.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shell, "_MAX_UNDECODED_BYTES", 2 * len(LARGE))
-    let_go = threading.Event()
-
-    def decode(payload: bytes) -> Request:
-        assert let_go.wait(PATIENCE_S)
-        return decode_request(payload)
-
-    monkeypatch.setattr(shell, "decode_request", decode)
     async with joined() as both:
         names = ["mallory"] * 3 + ["anna", "berta", "anna", "carla"]
-        calls = [LargeCall(name) for name in names]
+        calls = [Call([], name, LARGE) for name in names]
         for call in calls:
             both.shell.deliver(call)
         for index in (2, 5, 6):  # hers beyond the room, and all beyond twice the room
@@ -373,39 +372,6 @@ async def test_what_happens_often_is_logged_now_and_then_with_its_number(event: 
         assert len(told) < 50
 
 
-async def test_close_does_not_wait_for_a_computation() -> None:
-    async with joined(workers=1) as both:
-        patient, call, _ = await both.robot_in_work(1)
-        both.shell.stop("enough")
-        assert await both.shell.wait() == "enough"
-        await both.shell.close()
-        assert both.shell.is_computing  # until the test lets it go
-        events: list[TransportEvent] = []
-        while CallEnded(call) not in events:
-            events.append(await patient.events.get())
-        assert ServiceVanished("service", "boot") in events
-
-
-async def test_a_service_that_drains_answers_whoever_is_still_there() -> None:
-    async with joined(workers=1) as both:
-        patient, call, _ = await both.robot_in_work(1)
-        drained = asyncio.create_task(both.shell.drain(PATIENCE_S))
-        await asyncio.sleep(0)
-        assert both.shell.is_draining
-        assert not drained.done()
-        both.held.let_go.set()
-        await drained
-        replies = (await patient.collect({call}))[call]
-        assert isinstance(replies[-1], SensingAnswer)
-
-
-async def test_draining_ends_at_its_bound() -> None:
-    async with joined(workers=1) as both:
-        await both.robot_in_work(1)
-        await both.shell.drain(0.01)
-        assert both.shell.is_computing
-
-
 # -- a machine that is scripted ------------------------------------------------------------------
 
 
@@ -452,23 +418,6 @@ class Scripted:
     def __init__(self, kind: str, run: Callable[[], object]) -> None:
         self.kind = kind
         self.run = run
-
-
-class Call:
-    """A call that notes what it is told."""
-
-    payload = b""
-    robot = "a robot"
-    on_gone: Callable[[], object] | None = None
-
-    def __init__(self, trace: list[str]) -> None:
-        self._trace = trace
-
-    def reply(self, payload: bytes, *, last: bool = False) -> None:
-        self._trace.append(f"{'last' if last else 'reply'} {payload.decode()}")
-
-    def end(self) -> None:
-        self._trace.append("end")
 
 
 def scripted(*jobs: tuple[str, float, Callable[[], object]]) -> tuple[Script, ServiceShell]:

@@ -5,21 +5,19 @@ from __future__ import annotations
 import argparse
 import hashlib
 import importlib
-import json
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.programs import said_by
 
 import holdfast
 from holdfast import _kernel
 from holdfast.config import registry
 from holdfast.config.imports import follow_imports
 from holdfast.config.source_digest import core_version, problem_digest, problem_sources
-from holdfast.journal.fingerprint import difference
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = Path(holdfast.__file__).parent
@@ -47,24 +45,17 @@ class Arm(Base, CapsuleRobot):
     "arm_parts/units.py": "",
     "arm_parts/unused.py": "",
 }
-OF_THE_ARM = {
-    "arm_problem",
-    "arm_base",
-    "arm_tables",
-    "arm_tables_more",
-    "arm_late",
-    "arm_parts",
-    "arm_parts.joints",
-    "arm_parts.limits",
-    "arm_parts.links",
-    "arm_parts.steel",
-    "arm_parts.units",
-}
+
+
+def module_of(file: str) -> str:
+    return file.removesuffix(".py").replace("/", ".").removesuffix(".__init__")
+
+
+OF_THE_ARM = {module_of(file) for file in SOURCES} - {"arm_stranger", "arm_parts.unused"}
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    monkeypatch.setattr(sys, "path", sys.path.copy())
+def folder(tmp_path: Path) -> Iterator[Path]:
     for name, text in SOURCES.items():
         path = tmp_path / "arm" / name
         path.parent.mkdir(exist_ok=True, parents=True)
@@ -94,8 +85,7 @@ class TestProblem:
         before = problem_digest(arm)
         with (folder / name).open("a") as file:
             file.write("X = 1\n")
-        module = name.removesuffix(".py").replace("/", ".").removesuffix(".__init__")
-        assert (problem_digest(arm) != before) == (module in OF_THE_ARM)
+        assert (problem_digest(arm) != before) == (module_of(name) in OF_THE_ARM)
 
     def test_the_place_does_not_count(self, folder: Path, tmp_path: Path) -> None:
         shutil.copytree(folder, tmp_path / "elsewhere")
@@ -106,12 +96,7 @@ class TestProblem:
             "print(problem_digest(registry.problem_class('arm_problem:Arm', Path(sys.argv[1]))))"
         )
         found = {
-            subprocess.run(
-                [sys.executable, *flags, "-c", program, str(place)],
-                check=True,
-                capture_output=True,
-                text=True,
-            ).stdout
+            said_by(program, str(place), flags=flags)
             for place, flags in (
                 (folder, ()),
                 (tmp_path / "elsewhere", ("-O",)),
@@ -251,10 +236,7 @@ class TestCore:
             "import holdfast, holdfast.config.source_digest as source_digest\n"
             "print(holdfast.__file__); print(source_digest.core_version())"
         )
-        done = subprocess.run(
-            [sys.executable, "-c", program], check=True, capture_output=True, text=True
-        )
-        file_name, version = done.stdout.split()
+        file_name, version = said_by(program).split()
         assert file_name == str(tmp_path / "holdfast" / "__init__.py")
         assert (version == core_version()) == (changed is None)
 
@@ -270,35 +252,3 @@ class TestCore:
             for name in (*sources, "CMakeLists.txt")
         )
         assert _kernel.sources() == hashlib.sha256(lines.encode()).hexdigest(), "build it again"
-
-
-HERE = {
-    "holdfast_version": "1.0",
-    "holdfast_core": "1.0+a",
-    "problem_sources": json.dumps({"arm": "1", "arm_tables": "2"}),
-}
-
-
-class TestDifference:
-    def test_none(self) -> None:
-        assert difference(HERE, HERE) is None
-
-    def test_core(self) -> None:
-        there = {**HERE, "holdfast_core": "1.0+b"}
-        words = "it was made by holdfast 1.0+b, this is 1.0+a: other code"
-        assert difference(there, HERE) == (words, "1.0+b", False)
-
-    @pytest.mark.parametrize(
-        ("there", "changed"),
-        [({"arm": "1"}, "arm_tables"), ({"arm": "0", "arm_tables": "2"}, "arm")],
-    )
-    def test_sources(self, there: dict[str, str], changed: str) -> None:
-        differs = difference({**HERE, "problem_sources": json.dumps(there)}, HERE)
-        words = f"the problem's source has changed since (module {changed})"
-        assert differs == (words, "1.0+a", True)
-
-    def test_a_journal_of_before_the_core_was_told(self) -> None:
-        there = {"holdfast_version": "1.0", "problem_sources": json.dumps({"arm": "1"})}
-        assert difference(there, HERE) is None
-        there["problem_sources"] = json.dumps({"arm": "0"})
-        assert difference(there, HERE) is not None

@@ -26,12 +26,16 @@ def timing(step: int = 9, service: str = "tcp/127.0.0.1:7447") -> Timing:
     return Timing(2, step, "task", service, "keep_alive", 1.5, 2.25, 0.75)
 
 
-def test_a_row(tmp_path: Path) -> None:
-    path = tmp_path / "timings.csv"
-    table = EventTable(path, Timing, clock=lambda: MOMENT_NS)
-    table.add(timing())
-    table.add(timing(service='a,"b"'))
+def written(path: Path, *rows: Timing | VerificationNoted) -> Path:
+    table = EventTable(path, type(rows[0]), clock=lambda: MOMENT_NS)
+    for row in rows:
+        table.add(row)
     table.close()
+    return path
+
+
+def test_a_row(tmp_path: Path) -> None:
+    path = written(tmp_path / "timings.csv", timing(), timing(service='a,"b"'))
     with path.open(newline="") as file:
         header, first, second = csv.reader(file)
     assert ",".join(header) == (
@@ -43,27 +47,16 @@ def test_a_row(tmp_path: Path) -> None:
 
 
 def test_it_goes_on_after_a_row_that_was_cut_off(tmp_path: Path) -> None:
-    path = tmp_path / "timings.csv"
-    table = EventTable(path, Timing)
-    table.add(timing(step=0))
-    table.add(timing(step=9))
-    table.close()
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-5])
-    table = EventTable(path, Timing)
-    table.add(timing(step=18))
-    table.close()
+    path = written(tmp_path / "timings.csv", timing(step=0), timing(step=9))
+    path.write_bytes(path.read_bytes()[:-5])
+    written(path, timing(step=18))
     with path.open(newline="") as file:
         assert [row["step"] for row in csv.DictReader(file)] == ["0", "18"]
 
 
 def test_it_is_read_while_it_grows(tmp_path: Path) -> None:
     """Whatever part of the file is there at the moment."""
-    path = tmp_path / "timings.csv"
-    table = EventTable(path, Timing, clock=lambda: MOMENT_NS)
-    for step in (0, 9):
-        table.add(timing(step=step))
-    table.close()
+    path = written(tmp_path / "timings.csv", timing(step=0), timing(step=9))
     content = path.read_bytes()
     path.unlink()
 
@@ -99,19 +92,17 @@ def test_a_full_disk(tmp_path: Path) -> None:
 
 class TestCountVerified:
     def test_each_verdict_counts(self, tmp_path: Path) -> None:
-        path = tmp_path / "verification.csv"
-        table = EventTable(path, VerificationNoted, clock=lambda: MOMENT_NS)
         cloud = "tcp/127.0.0.1:7447"
-        for step, kind, verdict in (
+        rows = (
             (0, "question", "asked"),
             (0, "task", "same"),
             (0, "sensing", "different"),
             (9, "question", "asked"),
             (9, "task", "not_deterministic"),
             (18, "question", "left_out"),
-        ):
-            table.add(VerificationNoted(1, step, cloud, kind, verdict))
-        table.close()
+        )
+        noted = (VerificationNoted(1, step, cloud, *told) for step, *told in rows)
+        path = written(tmp_path / "verification.csv", *noted)
         head, first = path.read_text().splitlines()[:2]
         assert head == "trial,step,service,kind,verdict,time,boot,uptime_s"
         assert first.startswith(f"1,0,{cloud},question,asked,2023-11-14T22:13:20.123456Z,")
@@ -123,8 +114,6 @@ class TestCountVerified:
 
 class TestCountAnswers:
     def test_each_decision_of_a_finished_trial_counts_once(self, tmp_path: Path) -> None:
-        path = tmp_path / "timings.csv"
-        table = EventTable(path, Timing)
         cloud, local = 'tcp/"a",b:7447', "local"
         rows = [
             (0, 0, "sensing", cloud, 4.0),
@@ -138,18 +127,14 @@ class TestCountAnswers:
             # Not finished.
             (2, 0, "sensing", "another", 5000.0),
         ]
-        for trial, step, kind, service, waited_ms in rows:
-            table.add(Timing(trial, step, kind, service, "standard", waited_ms, 1.0, 1.0))
-        table.close()
+        timings = (Timing(*row[:4], "standard", row[4], 1.0, 1.0) for row in rows)
+        path = written(tmp_path / "timings.csv", *timings)
         counts = count_answers(path, {0, 1})
         assert counts == AnswerCounts({cloud: 2, local: 1}, {cloud: 2, local: 1}, 900.0)
         assert list(counts.sensing_decisions_by_service) == [cloud, local]
 
     def test_damaged_rows_do_not_count(self, tmp_path: Path) -> None:
-        path = tmp_path / "timings.csv"
-        table = EventTable(path, Timing)
-        table.add(timing())
-        table.close()
+        path = written(tmp_path / "timings.csv", timing())
         with path.open("ab") as file:
             file.write(b"2,18,task\n\0\0\0\0\n2,x,task,a,b,1.0,1.0,1.0,now\n\xff\xfe\n")
         assert count_answers(path, {2}) == AnswerCounts({}, {"tcp/127.0.0.1:7447": 1}, 1.5)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.command_line import Workplace
 
-from holdfast.cli import main
 from holdfast.config.loader import load
 from holdfast.config.user_code import find_class, is_users_file
 from holdfast.errors import ConfigurationError
@@ -30,11 +29,12 @@ def test_theirs(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
     assert is_users_file(str(tmp_path / name))
 
 
+Ending = Callable[..., str]
+
 EXITS = """
 import sys
 
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
-
 
 class InThePolicy(PegInHole2D):
     actions = 0
@@ -46,38 +46,31 @@ class InThePolicy(PegInHole2D):
                 sys.exit(0)
         return super().limit_action(actions)
 
-
 class InTheWorld(PegInHole2D):
     def move(self, states, actions, stream):
         if states.ndim == 1:
             sys.exit(0)
         return super().move(states, actions, stream)
 
-
 class InTheConstructor(PegInHole2D):
     def __init__(self, *settings):
         sys.exit(0)
-
 
 class WithoutException(PegInHole2D):
     def policy(self, states, stage):
         raise GeneratorExit("enough")
 
-
 class Wordless(Exception):
     def __str__(self):
         sys.exit(0)
-
 
 class WithoutWords(PegInHole2D):
     def policy(self, states, stage):
         raise Wordless
 
-
 class WithManyWords(PegInHole2D):
     def policy(self, states, stage):
         raise ValueError("many\\n" * 100_000)
-
 
 class Recursive(PegInHole2D):
     def policy(self, states, stage):
@@ -86,15 +79,12 @@ class Recursive(PegInHole2D):
     def turn(self, states, stage):
         return self.policy(states, stage)
 
-
 class WithoutSetter(PegInHole2D):
     resolution = property(lambda self: 1.0)
-
 
 class RobotThatExits:
     def __init__(self):
         sys.exit(0)
-
 
 class SensorThatExits:
     def perform_sensing(self, sensing_action):
@@ -118,33 +108,23 @@ simulator: {num_trials: 2, max_steps: 30, seed: 3}
 class TestWhateverItRaises:
     """A run ends with an error that names the code at fault, and never as if all were done."""
 
-    @pytest.fixture(autouse=True)
-    def workplace(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "path", [*sys.path])
-        (tmp_path / "exits.py").write_text(EXITS)
-        (tmp_path / "exits_at_import.py").write_text("import sys\n\nsys.exit(0)\n")
-        (tmp_path / "peg.yaml").write_text(PEG)
-        yield
-        for name in ("exits", "exits_at_import"):
-            sys.modules.pop(name, None)
+    @pytest.fixture
+    def ending(self, workplace: Workplace) -> Ending:
+        """Run a command, and return the error that it ends with."""
+        workplace.write("exits.py", EXITS)
+        workplace.write("exits_at_import.py", "import sys\n\nsys.exit(0)\n")
+        workplace.write("peg.yaml", PEG)
 
-    def ending(
-        self,
-        arguments: list[str],
-        capsys: pytest.CaptureFixture[str],
-        monkeypatch: pytest.MonkeyPatch,
-    ) -> str:
-        monkeypatch.setattr(sys, "argv", ["holdfast", *arguments])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        said = capsys.readouterr().err
-        assert ended.value.code == (4 if "\nGo on with: " in said else 2), said
-        assert "Traceback" not in said
-        error = said.partition("holdfast: error: ")[2]
-        assert 0 < error.count("\n") < 40
-        assert len(error) < 6000
-        return error
+        def run(*arguments: str) -> str:
+            said = workplace.run(*arguments)
+            assert said.code == (4 if "\nGo on with: " in said.stderr else 2), said
+            assert "Traceback" not in said.stderr
+            error = said.stderr.partition("holdfast: error: ")[2]
+            assert 0 < error.count("\n") < 40
+            assert len(error) < 6000
+            return error
+
+        return run
 
     @pytest.mark.parametrize(
         ("name", "what", "where"),
@@ -159,38 +139,25 @@ class TestWhateverItRaises:
             ("WithoutSetter", "cannot be built: AttributeError: property", ""),
         ],
     )
-    def test_a_problem(
-        self,
-        name: str,
-        what: str,
-        where: str,
-        capsys: pytest.CaptureFixture[str],
-        monkeypatch: pytest.MonkeyPatch,
-    ) -> None:
+    def test_a_problem(self, name: str, what: str, where: str, ending: Ending) -> None:
         command = ["run", "peg.yaml", "--problem", f"exits:{name}", "--out", "out"]
-        error = self.ending(command, capsys, monkeypatch)
+        error = ending(*command)
         assert what in error
         assert where in error
         if name == "InThePolicy":
             assert error.startswith("trial 1 (seed 3): ")
         if name in {"InThePolicy", "WithoutWords"}:  # a robot's loop says it as well
             command[-1:] = ["robot", "--rate", "10000"]
-            error = self.ending(command, capsys, monkeypatch)
+            error = ending(*command)
             assert what in error
             assert where in error
 
     @pytest.mark.parametrize(
         ("name", "where"), [("RobotThatExits", "in __init__"), ("SensorThatExits", "in perform_")]
     )
-    def test_an_environment(
-        self,
-        name: str,
-        where: str,
-        capsys: pytest.CaptureFixture[str],
-        monkeypatch: pytest.MonkeyPatch,
-    ) -> None:
+    def test_an_environment(self, name: str, where: str, ending: Ending) -> None:
         command = ["run", "peg.yaml", "--environment", f"exits:{name}", "--out", "out"]
-        error = self.ending(command, capsys, monkeypatch)
+        error = ending(*command)
         assert f"exits:{name}" in error
         assert "raised SystemExit: 0" in error
         assert where in error
@@ -204,27 +171,23 @@ class TestWhateverItRaises:
         ],
         ids=lambda command: command[0] + command[-2],
     )
-    def test_a_module(
-        self,
-        command: list[str],
-        capsys: pytest.CaptureFixture[str],
-        monkeypatch: pytest.MonkeyPatch,
-    ) -> None:
-        error = self.ending(command, capsys, monkeypatch)
+    def test_a_module(self, command: list[str], ending: Ending, workplace: Workplace) -> None:
+        error = ending(*command)
         assert "exits_at_import:X raised SystemExit: 0\n" in error
         assert "line 3, in <module>" in error
-        assert not Path("runs").exists()
+        assert "runs" not in workplace.names()
 
     @pytest.mark.parametrize("name", ["collections:OrderedDict", "builtins:int", "enum:Enum"])
-    def test_a_class_that_is_no_problem(
-        self, name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        error = self.ending(["run", "peg.yaml", "--problem", name], capsys, monkeypatch)
+    def test_a_class_that_is_no_problem(self, name: str, ending: Ending) -> None:
+        error = ending("run", "peg.yaml", "--problem", name)
         assert error.startswith(f"peg.yaml: {name} ")
         assert error.count("\n") == 1
 
-    def test_ctrl_c_is_not_the_code_s(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        configuration = load("peg.yaml")
+    def test_ctrl_c_is_not_the_code_s(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "peg.yaml").write_text(PEG)
+        configuration = load(tmp_path / "peg.yaml")
 
         def policy(*_: object) -> None:
             raise KeyboardInterrupt

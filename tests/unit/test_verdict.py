@@ -40,17 +40,16 @@ def rows(
     ]
 
 
+def trials_of(configured: float, random: float, **others: float) -> dict[str, list[TrialRow]]:
+    """Return the trials of candidates by how many steps more they take."""
+    more = {AS_CONFIGURED: configured, RANDOM: random, **others}
+    return {name: rows(name, steps) for name, steps in more.items()}
+
+
 def test_a_winner_that_is_better() -> None:
-    found = judge(
-        {
-            AS_CONFIGURED: rows(AS_CONFIGURED, 10.0),
-            "state_entropy": rows("state_entropy", 0.0, decision_ms=20.0),
-            RANDOM: rows(RANDOM, 20.0),
-        },
-        ["state_entropy"],
-        "steps",
-        LIMIT,
-    )
+    trials = trials_of(10.0, 20.0)
+    trials["state_entropy"] = rows("state_entropy", 0.0, decision_ms=20.0)
+    found = judge(trials, ["state_entropy"], "steps", LIMIT)
     assert (found.choice, found.matters) == ("state_entropy", True)
     first = found.comparisons[0]
     assert (first.against, first.measure, first.finding) == (AS_CONFIGURED, "steps", 1)
@@ -62,29 +61,26 @@ def test_a_winner_that_is_better() -> None:
 
 
 def test_a_winner_that_was_only_lucky() -> None:
-    trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 0.0), "lucky": rows("lucky", 3.0)}
-    trials[RANDOM] = rows(RANDOM, 20.0)
-    found = judge(trials, ["lucky"], "steps", LIMIT)
+    found = judge(trials_of(0.0, 20.0, lucky=3.0), ["lucky"], "steps", LIMIT)
     assert found.choice == AS_CONFIGURED
     assert found.sentence.startswith("Keep your configuration: ")
 
 
 def test_random_where_it_is_best() -> None:
-    trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 30.0), "path": rows("path", 20.0)}
-    trials[RANDOM] = rows(RANDOM, 0.0)
+    trials = trials_of(30.0, 0.0, path=20.0)
     assert judge(trials, ["path"], "steps", LIMIT).sentence.startswith("Sense at random: ")
 
 
 def test_no_trial_succeeds() -> None:
     trials = {
-        name: [each._replace(success=False) for each in rows(name, 0.0)]
-        for name in (AS_CONFIGURED, "other", RANDOM)
+        name: [each._replace(success=False) for each in found]
+        for name, found in trials_of(0.0, 0.0, other=0.0).items()
     }
     assert "No trial succeeded" in judge(trials, ["other"], "steps", LIMIT).sentence
 
 
 def test_nothing_matters() -> None:
-    trials = {name: rows(name, 0.0) for name in (AS_CONFIGURED, "other", RANDOM)}
+    trials = trials_of(0.0, 0.0, other=0.0)
     found = judge(trials, ["other"], "steps", LIMIT)
     assert (found.choice, found.matters) == (AS_CONFIGURED, False)
     assert found.sentence.startswith("What you sense does not matter here, as far as 200 trials")
@@ -115,7 +111,7 @@ def test_other_measures_may_say_otherwise() -> None:
 
 
 def test_slower_decisions_need_a_reason() -> None:
-    trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 0.5), RANDOM: rows(RANDOM, 30.0)}
+    trials = trials_of(0.5, 30.0)
     trials["slow"] = rows("slow", 0.0, decision_ms=20.0)
     trials["quick"] = rows("quick", 0.0, decision_ms=1.5)
     quick = {name: trials[name] for name in (AS_CONFIGURED, "quick", RANDOM)}
@@ -125,7 +121,7 @@ def test_slower_decisions_need_a_reason() -> None:
 
 
 def test_of_two_finalists_the_quick_one_if_it_is_as_good() -> None:
-    trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 30.0), RANDOM: rows(RANDOM, 30.0)}
+    trials = trials_of(30.0, 30.0)
     trials["slow"] = rows("slow", 0.0, decision_ms=20.0)
     trials["quick"] = rows("quick", 0.0, decision_ms=2.0)
     found = judge(trials, ["slow", "quick"], "steps", LIMIT)
@@ -145,7 +141,7 @@ def test_of_two_finalists_the_quick_one_if_it_is_as_good() -> None:
 
 
 def test_a_slow_one_does_not_hide_that_random_sensing_is_better() -> None:
-    trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 8.0), RANDOM: rows(RANDOM, 0.0)}
+    trials = trials_of(8.0, 0.0)
     swings = [60 * (-1) ** n for n in range(len(WORLDS))]
     trials["slow"] = [
         row._replace(candidate="slow", steps=row.steps - 2 + swing, decision_ms=20.0)
@@ -157,8 +153,7 @@ def test_a_slow_one_does_not_hide_that_random_sensing_is_better() -> None:
 
 
 def test_a_finalist_that_failed_afterwards_is_not_chosen() -> None:
-    trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 0.0), RANDOM: rows(RANDOM, 0.0)}
-    assert judge(trials, ["gone"], "steps", LIMIT, {AS_CONFIGURED}).choice == RANDOM
+    assert judge(trials_of(0.0, 0.0), ["gone"], "steps", LIMIT, {AS_CONFIGURED}).choice == RANDOM
 
 
 def test_who_is_barred_is_not_chosen() -> None:

@@ -21,20 +21,15 @@ def test_all_files_tell_the_same_version() -> None:
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     newest = re.search(r"^## (\S+)", changes, re.MULTILINE)
     assert newest is not None
-    assert {
+    told = {
         "pyproject.toml": project["version"],
         "lab/pyproject.toml": lab["version"],
         "CITATION.cff": str(citation["version"]),
         "CHANGELOG.md": newest[1],
         "installed": metadata.version("holdfast-sensing"),
         "installed, the laboratory": metadata.version("holdfast-lab"),
-    } == dict.fromkeys(
-        (
-            *("pyproject.toml", "lab/pyproject.toml", "CITATION.cff", "CHANGELOG.md"),
-            *("installed", "installed, the laboratory"),
-        ),
-        holdfast.__version__,
-    )
+    }
+    assert told == dict.fromkeys(told, holdfast.__version__)
     assert lab["dependencies"] == [f"holdfast-sensing[figures,service]=={holdfast.__version__}"]
     assert re.fullmatch(r"\d+\.\d+\.\d+", holdfast.__version__)
     assert citation["license"] == project["license"]

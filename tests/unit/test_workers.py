@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import struct
-import subprocess
 import sys
 import threading
 from collections.abc import Iterable
 from multiprocessing.connection import Connection
 
 import pytest
+from tests.programs import said_by
 
 from holdfast.runtime.workers import WorkerProcess, end_workers
 
@@ -72,10 +72,7 @@ if __name__ == "__main__":
     worker.start()
     print(worker.receive(), flush=True)
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60.0
-    )
-    assert (done.returncode, done.stdout) == (0, "b'here'\n"), done.stderr
+    assert said_by(program) == "b'here'\n"
 
 
 def test_threads_that_start_workers_leave_the_process_as_it_was() -> None:
