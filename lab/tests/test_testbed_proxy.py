@@ -1,7 +1,5 @@
 """The bad line: what it does to bytes, and what it never does. No time is asserted."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import threading
@@ -225,10 +223,7 @@ class TestDatagrams:
     @pytest.mark.parametrize("direction", ["both", "to_service", "to_robot"])
     def test_silence_swallows_them(self, datagram_echo: DatagramEcho, direction: Any) -> None:
         port = free_port()
-        with (
-            datagram_line(port, datagram_echo.port, 0.0, 0.0) as proxy,
-            client_of(port) as client,
-        ):
+        with datagram_line(port, datagram_echo.port, 0.0, 0.0) as proxy, client_of(port) as client:
             heal = proxy.impair(Impairment(silent=True, direction=direction))
             client.send(b"lost")
             assert not comes_briefly(client)

@@ -90,18 +90,6 @@ class TestTasks:
         monkeypatch.setattr(tasks, "code_of", lambda task: f"another {task.kind}")
         assert task_key(task) != before
 
-    def test_the_key_names_the_sources_of_a_problem(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        place = "studies.light_dark:LightDark"
-        task = next(trial_tasks(series(problem=place), 100))
-        before = task_key(task)
-        found = tasks._digest_behind
-        monkeypatch.setattr(
-            tasks,
-            "_digest_behind",
-            lambda at, whole=False: "another" if at == place else found(at, whole),
-        )
-        assert task_key(task) != before
-
     def test_an_edited_source_is_noticed(self, tmp_path: Path) -> None:
         """In a process of its own, whose package is a copy."""
         for package in (holdfast, holdfast_lab, studies):

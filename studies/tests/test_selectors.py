@@ -1,7 +1,5 @@
 """What the studies of ways and parameters make of results that are known beforehand."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The simulated world: a function of its seed, its trial and what is done in it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A recorded run as ROS 2 messages and as tables, read back by other people's readers."""
 
-from __future__ import annotations
-
 import csv
 import itertools
 import json
@@ -25,8 +23,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.typesys import Stores, get_typestore
 from tests.command_line import Said, run_here
+from tests.mistakes import mistakes_in
 
 import holdfast as hf
+from holdfast.cli.application import find_command
 from holdfast.config.loader import Configuration, load
 from holdfast.config.registry import BUILT_IN
 from holdfast.errors import UntrustedCodeError
@@ -158,18 +158,29 @@ def seen_in(configuration: Configuration, trials: range) -> list[Seen]:
 class Place:
     """A directory in which runs are made and exported."""
 
-    def __init__(self, directory: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def __init__(
+        self, directory: Path, capsys: pytest.CaptureFixture[str], recorded: Path | None = None
+    ) -> None:
         self.directory = directory
         self._capsys = capsys
+        self._recorded = recorded
 
     def call(self, *words: str) -> Said:
         return run_here(self._capsys, self.directory, *words)
 
     def run(self, text: str, *options: str, code: int = 0) -> Path:
         (self.directory / "run.yaml").write_text(text)
+        run = self.directory / "run"
+        if text == PEG and not options and self._recorded:
+            shutil.copytree(self._recorded, run)
+            return run
         said = self.call("run", "run.yaml", "--out", "run", "-q", *options)
         assert said.code == code, said.stderr
-        return self.directory / "run"
+        return run
+
+    def run_cart(self, pose: str = "") -> Path:
+        (self.directory / "cart.py").write_text(OWN_PROBLEM.replace("POSE", pose))
+        return self.run(PEG.replace("peg_in_hole_2d", "cart:Cart"))
 
     def export(self, *options: str, code: int = 0) -> Said:
         said = self.call("export", "run", *options)
@@ -179,9 +190,28 @@ class Place:
         return said
 
 
+EXPORT = ("export", "run", "--mcap", "run.mcap", "--csv", "tables", "-q")
+
+
+def make(directory: Path, text: str, *then: tuple[str, ...]) -> Path:
+    """Run a configuration in a directory, and other commands after it."""
+    (directory / "run.yaml").write_text(text)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(directory)
+        for words in (("run", "run.yaml", "--out", "run", "-q"), *then):
+            assert find_command(list(words)).run(list(words[1:])) == 0
+    return directory / "run"
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a run that tests copy."""
+    return make(tmp_path_factory.mktemp("recorded"), PEG)
+
+
 @pytest.fixture
-def place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Place:
-    return Place(tmp_path, capsys)
+def place(tmp_path: Path, capsys: pytest.CaptureFixture[str], recorded: Path) -> Place:
+    return Place(tmp_path, capsys, recorded)
 
 
 class Message(NamedTuple):
@@ -243,16 +273,7 @@ def built_in(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Configuration, Path, list[Seen]]]:
     directory = tmp_path_factory.mktemp("built_in")
-    (directory / "run.yaml").write_text(PEG.replace("peg_in_hole_2d", request.param))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(directory)
-        from holdfast.cli.application import find_command
-
-        for words in (
-            ["run", "run.yaml", "--out", "run", "-q"],
-            ["export", "run", "--mcap", "run.mcap", "--csv", "tables", "-q"],
-        ):
-            assert find_command(words).run(words[1:]) == 0
+    make(directory, PEG.replace("peg_in_hole_2d", request.param), EXPORT)
     configuration = load(directory / "run.yaml")
     yield configuration, directory, seen_in(configuration, range(2))
 
@@ -548,21 +569,12 @@ MINE = ("--problem-directory", ".")
 class TestOwnCode:
     @pytest.mark.parametrize(
         ("pose", "positions"),
-        [
-            ("", None),
-            ('pose = ("z", None)', (0.0, 0.0, 1.0)),
-            ('pose = ("x",)', (1.0, 0.0, 0.0)),
-        ],
+        [("", None), ('pose = ("z", None)', (0.0, 0.0, 1.0)), ('pose = ("x",)', (1.0, 0.0, 0.0))],
     )
     def test_a_problem_says_its_pose_or_has_none(
-        self,
-        pose: str,
-        positions: tuple[float, float, float] | None,
-        place: Place,
-        tmp_path: Path,
+        self, pose: str, positions: tuple[float, float, float] | None, place: Place, tmp_path: Path
     ) -> None:
-        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", pose))
-        place.run(PEG.replace("peg_in_hole_2d", "cart:Cart"))
+        place.run_cart(pose)
         said = place.export("--mcap", "run.mcap", *MINE)
         messages = by_mcap(tmp_path / "run.mcap")
         tables = of_topic(messages, "/holdfast/belief")
@@ -581,14 +593,10 @@ class TestOwnCode:
             assert np.array_equal(found, states[:, :1] * np.array(positions))
 
     def test_code_that_a_record_names_is_not_run_unasked(
-        self,
-        place: Place,
-        monkeypatch: pytest.MonkeyPatch,
-        tmp_path: Path,
+        self, place: Place, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         """Wherever a module of that name lies: where it did, beside the journal, or here."""
-        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
-        run = place.run(PEG.replace("peg_in_hole_2d", "cart:Cart"))
+        run = place.run_cart()
         ran = tmp_path / "ran"
         source = f"open({str(ran)!r}, 'w')\n"
         for directory in (tmp_path, run):
@@ -609,15 +617,6 @@ class TestOwnCode:
         assert len(list(opened.read())) == len(opened.trials)
         sys.modules.pop("cart", None)
         assert not ran.exists()
-
-    def test_a_module_is_looked_for_only_where_the_caller_says(
-        self, place: Place, tmp_path: Path
-    ) -> None:
-        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
-        place.run(PEG.replace("peg_in_hole_2d", "cart:Cart"))
-        (tmp_path / "elsewhere").mkdir()
-        options = ("--csv", "tables", "--problem-directory", "elsewhere")
-        assert "there is no module cart" in place.export(*options, code=2).stderr
 
     def test_in_a_world_of_ones_own(self, place: Place, tmp_path: Path) -> None:
         """What the world has shown is in the journal, of the trial that is not finished as well."""
@@ -672,8 +671,7 @@ class TestOwnCode:
 
 class TestDecisionsAreCompared:
     def test_another_problem_is_noticed(self, place: Place, tmp_path: Path) -> None:
-        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
-        place.run(PEG.replace("peg_in_hole_2d", "cart:Cart"))
+        place.run_cart()
         (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", "").replace("0.3", "0.45"))
         said = place.export("--csv", "tables", "--mcap", "run.mcap", *MINE, code=2)
         assert "trial 0: the decision of step 0 differs when it is computed again" in said.stderr
@@ -728,31 +726,17 @@ class TestUnfinished:
 
 class TestRefusals:
     @pytest.mark.parametrize(
-        ("options", "message"),
+        ("line", "message"),
         [
-            ((), "nothing to write: give --mcap FILE, --csv DIR or --figure FILE"),
-            (("--csv", "there"), "there: holds files already; remove it, or choose another"),
-            (("--csv", "run.yaml"), "run.yaml: exists already; remove it, or choose another"),
-            (("--mcap", "there"), "there: exists already"),
-            (("--mcap", "no/run.mcap"), "there is no directory no"),
-            (("--csv", "one", "--mcap", "one"), "--mcap and --csv are both one; give two places"),
-            (("--csv", "one", "--trials", "5:"), "--trials is '5:'; allowed are one trial N, or"),
-            (("--csv", "one", "--trials", "5"), "has no trial 5 (--trials); it has 2 trials"),
-            (("--figure", "one.gif"), "--figure is 'one.gif'; allowed are names that end with .pd"),
-            (("--csv", "one", "--trials", "2:9"), "has no trial from 2 to 8 (--trials); it has 2"),
+            *mistakes_in("export_mistakes.txt"),
+            ("", "nothing to write: give --mcap FILE, --csv DIR or --figure FILE"),
         ],
     )
-    def test_options(
-        self,
-        options: tuple[str, ...],
-        message: str,
-        place: Place,
-        tmp_path: Path,
-    ) -> None:
+    def test_options(self, line: str, message: str, place: Place, tmp_path: Path) -> None:
         place.run(PEG)
         (tmp_path / "there").mkdir()
         (tmp_path / "there" / "file").write_text("mine")
-        said = place.export(*options, code=2)
+        said = place.export(*line.split(), code=2)
         assert message in said.stderr
         assert (tmp_path / "there" / "file").read_text() == "mine"
         assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "run.yaml", "there"]
@@ -774,13 +758,8 @@ class TestRefusals:
         assert not (tmp_path / "tables").exists()
 
     def test_without_rosbags(
-        self,
-        place: Place,
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
+        self, place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        import sys
-
         place.run(PEG)
         monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
         said = place.export("--mcap", "run.mcap", code=2)
@@ -798,10 +777,7 @@ class TestNothingHalfWritten:
     """Neither at the places nor beside them; :func:`export` looks for the latter."""
 
     def test_interrupted(
-        self,
-        place: Place,
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
+        self, place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         from holdfast.reports.csv_export import CsvSink
 

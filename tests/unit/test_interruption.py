@@ -1,7 +1,5 @@
 """A computation ends at its next check, once nobody awaits it."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

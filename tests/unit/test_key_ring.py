@@ -1,7 +1,5 @@
 """The key ring: what it makes, renews and refuses, and that nothing is ever half done."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
@@ -10,7 +8,9 @@ import subprocess
 import sys
 import textwrap
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
@@ -328,15 +328,13 @@ class TestArguments:
         with pytest.raises(CredentialsError, match=r"10\.0\.0\.7': .*\(--service NAME;"):
             make_credentials(tmp_path, robots=["arm"], hosts=["10.0.0.7"])
 
-    @pytest.mark.parametrize("days", [0, -1, 3651])
-    def test_days_have_bounds(self, tmp_path: Path, days: int) -> None:
-        with pytest.raises(CredentialsError, match=f"days: {days} is not between 1 and 3650"):
-            make_credentials(tmp_path, days=days)
-
-    @pytest.mark.parametrize("days", [1, 3650])
-    def test_the_least_and_the_most_days(self, tmp_path: Path, days: int) -> None:
-        made = make_credentials(tmp_path, robots=["arm"], days=days)
-        assert made.made[0].expires - datetime.now(UTC) > (days - 1) * DAY
+    def test_days_have_bounds(self, tmp_path: Path) -> None:
+        for days in (0, -1, 3651):
+            with pytest.raises(CredentialsError, match=f"days: {days} is not between 1 and 3650"):
+                make_credentials(tmp_path, days=days)
+        for days in (1, 3650):
+            made = make_credentials(tmp_path / str(days), robots=["arm"], days=days)
+            assert made.made[0].expires - datetime.now(UTC) > (days - 1) * DAY
 
     def test_a_name_of_64_letters_and_an_empty_directory_of_it(self, tmp_path: Path) -> None:
         (tmp_path / ("x" * 64)).mkdir()
@@ -344,7 +342,7 @@ class TestArguments:
         load_credentials(tmp_path / ("x" * 64), "robot")
 
     def test_as_many_names_as_one_call_may_have(
-        self, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(key_ring, "MAX_PARTIES", 2)
         make_credentials(tmp_path, robots=["a"], services=["b"])
@@ -352,8 +350,9 @@ class TestArguments:
             make_credentials(tmp_path, robots=["c", "d"], services=["e"])
 
 
-def run_keys(capsys: pytest.CaptureFixture[str], home: Path, *arguments: str) -> Said:
-    return run_here(capsys, home.parent, "keys", str(home), *arguments)
+@pytest.fixture
+def keys(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., Said]:
+    return partial(run_here, capsys, tmp_path.parent, "keys", str(tmp_path))
 
 
 KILLED_AT_EACH_MOMENT = """
@@ -465,11 +464,9 @@ class TestCommand:
         assert serials[0] == before
         assert serials[2] == certificate_of(tmp_path / "anna").serial_number
 
-    def test_it_makes_keys_and_says_what_goes_where(
-        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
-    ) -> None:
-        home = tmp_path / "keys"
-        done = run_keys(capsys, home, "--host", "10.0.0.7", "--days", "30")
+    def test_it_makes_keys_and_says_what_goes_where(self, keys: Any, tmp_path: Path) -> None:
+        home = tmp_path
+        done = keys("--host", "10.0.0.7", "--days", "30")
         assert (done.code, done.stderr) == (0, "")
         assert f"{home / 'authority' / 'authority.key'} stays here" in done.stdout
         assert f"--tls {home / 'service'}" in done.stdout
@@ -477,22 +474,18 @@ class TestCommand:
         assert "--service tls/10.0.0.7:7447" in done.stdout
         load_credentials(home / "service", "service")
 
-    def test_again_it_refuses_and_renews_if_told_to(
-        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
-    ) -> None:
-        assert run_keys(capsys, tmp_path).code == 0
-        done = run_keys(capsys, tmp_path)
+    def test_again_it_refuses_and_renews_if_told_to(self, keys: Any, tmp_path: Path) -> None:
+        assert keys().code == 0
+        done = keys()
         assert done.code == 2
         assert done.stderr.startswith("holdfast: error: ")
         assert "service/certificate.pem: exists already" in done.stderr
-        done = run_keys(capsys, tmp_path, "--renew")
+        done = keys("--renew")
         assert done.code == 0
         assert f"{tmp_path / 'robot' / 'certificate.pem'} for robot 'robot'" in done.stdout
 
-    def test_names_are_repeated_options(
-        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
-    ) -> None:
-        done = run_keys(capsys, tmp_path, "--robot", "a", "--robot", "b", "--service", "c")
+    def test_names_are_repeated_options(self, keys: Any, tmp_path: Path) -> None:
+        done = keys("--robot", "a", "--robot", "b", "--service", "c")
         assert done.code == 0
         assert {path.name for path in tmp_path.iterdir()} == {"authority", "a", "b", "c"}
         # Each has its own command.

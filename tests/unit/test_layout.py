@@ -1,7 +1,5 @@
 """The tree: each module has its tests, and each folder of the product its line in ARCHITECTURE."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path

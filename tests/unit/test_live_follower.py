@@ -1,7 +1,5 @@
 """The process that shows a run comes to the robot's own beliefs, and leaves out what is late."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Lines of the log: the same event for a person and for a program, always one bounded line."""
 
-from __future__ import annotations
-
 import io
 import json
 import re
