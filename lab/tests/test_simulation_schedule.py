@@ -1,7 +1,7 @@
 """Schedules: what is drawn can be written down and read back, and what is none is refused."""
 
 import pytest
-from tests.mistakes import mistakes_in
+from tests.answers import answers_in
 
 from holdfast_lab.errors import ScheduleError
 from holdfast_lab.simulation.schedule import (
@@ -62,7 +62,7 @@ def test_text_is_as_short_as_it_can_be() -> None:
     assert parse_schedule("") == SimulationSchedule(RunSettings())
 
 
-@pytest.mark.parametrize(("line", "says"), mistakes_in("schedule_mistakes.txt"))
+@pytest.mark.parametrize(("line", "says"), answers_in("schedule_mistakes.txt"))
 def test_what_is_no_schedule_is_refused(line: str, says: str) -> None:
     with pytest.raises(ScheduleError) as raised:
         parse_schedule(line)

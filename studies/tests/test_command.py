@@ -7,7 +7,7 @@ from pathlib import Path
 from time import monotonic, sleep
 
 import pytest
-from tests.mistakes import mistakes_in
+from tests.answers import answers_in
 
 from holdfast.errors import InvalidValueError, OptionError
 from studies.command import main, studies_of, study_names
@@ -23,7 +23,7 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "message"), [*mistakes_in("study_mistakes.txt"), ("", "NAME is missing")]
+    ("line", "message"), [*answers_in("study_mistakes.txt"), ("", "NAME is missing")]
 )
 def test_bad_arguments(line: str, message: str, tmp_path: Path) -> None:
     with pytest.raises((InvalidValueError, OptionError, TrialFileError), match=message):

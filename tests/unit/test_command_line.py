@@ -5,8 +5,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.answers import answers_in
 from tests.command_line import commands, options_of
-from tests.mistakes import mistakes_in
 
 from holdfast.cli import main
 from holdfast.errors import OptionError
@@ -63,7 +63,7 @@ def test_words_with_a_dash_in_front_are_read_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "message"), [*mistakes_in("option_mistakes.txt"), ("", "BEANS is missing")]
+    ("line", "message"), [*answers_in("option_mistakes.txt"), ("", "BEANS is missing")]
 )
 def test_bad_arguments(line: str, message: str) -> None:
     with pytest.raises(OptionError) as refused:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from tests.mistakes import mistakes_in
+from tests.answers import answers_in
 
 from holdfast.config import registry
 from holdfast.config.loader import Configuration, load
@@ -366,7 +366,7 @@ LONG = "model: [" + "1," * 100_001 + "]"
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        *mistakes_in("config_mistakes.txt"),
+        *answers_in("config_mistakes.txt"),
         # What would be too long there, or cannot be seen.
         ("model:\n  a: '\x01'\n", "line 2: not YAML: the character U+0001 is not allowed"),
         ("", "run.yaml: is empty; a configuration has the sections model,"),

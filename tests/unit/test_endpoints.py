@@ -4,7 +4,7 @@ import socket
 from pathlib import Path
 
 import pytest
-from tests.mistakes import mistakes_in
+from tests.answers import answers_in
 
 from holdfast.errors import TransportError
 from holdfast.transport.endpoints import Endpoint, TlsFiles, check_credentials, parse_endpoint
@@ -32,7 +32,7 @@ def test_an_endpoint_is_read_and_written(text: str, expected: Endpoint) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        *mistakes_in("endpoint_mistakes.txt"),
+        *answers_in("endpoint_mistakes.txt"),
         ("", "does not begin with a protocol.*tcp, tls, udp and unix"),
         ("tcp/localhost:" + "9" * 5000, "is not a number from 0"),
     ],

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.mistakes import mistakes_in
+from tests.answers import answers_in
 
 from holdfast.config.loader import load
 from holdfast.errors import ConfigurationError, EnvironmentFailedError
@@ -130,7 +130,7 @@ class TestLoadEnvironment:
         ):
             maker(0)
 
-    @pytest.mark.parametrize(("text", "expected"), mistakes_in("environment_mistakes.txt"))
+    @pytest.mark.parametrize(("text", "expected"), answers_in("environment_mistakes.txt"))
     def test_what_is_refused(self, text: str, expected: str, loaded: Loaded) -> None:
         with pytest.raises(ConfigurationError, match=expected) as caught:
             loaded(text)

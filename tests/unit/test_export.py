@@ -22,8 +22,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.typesys import Stores, get_typestore
+from tests.answers import answers_in
 from tests.command_line import Said, run_here
-from tests.mistakes import mistakes_in
 
 import holdfast as hf
 from holdfast.cli.application import find_command
@@ -728,7 +728,7 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("line", "message"),
         [
-            *mistakes_in("export_mistakes.txt"),
+            *answers_in("export_mistakes.txt"),
             ("", "nothing to write: give --mcap FILE, --csv DIR or --figure FILE"),
         ],
     )

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from gymnasium import spaces
 from tests import mountain_car
-from tests.mistakes import mistakes_in
+from tests.answers import answers_in
 
 import holdfast as hf
 from holdfast.config.loader import load
@@ -303,7 +303,7 @@ class TestWhatIsShown:
 
 
 class TestWhatIsRefused:
-    @pytest.mark.parametrize(("text", "says"), mistakes_in("gymnasium_mistakes.txt"))
+    @pytest.mark.parametrize(("text", "says"), answers_in("gymnasium_mistakes.txt"))
     def test_arguments(self, text: str, says: str) -> None:
         arguments: Any = {"env_id": CAR, "sensing": [[0], [1]], **yaml.safe_load(f"{{{text}}}")}
         with pytest.raises(ConfigurationError, match=says):
