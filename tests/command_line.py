@@ -12,7 +12,7 @@ import pytest
 
 from holdfast.cli import main
 from holdfast.cli.added_commands import added_commands
-from holdfast.cli.application import COMMANDS
+from holdfast.cli.application import COMMANDS, find_command
 from holdfast.runtime.command_line import Options
 
 
@@ -52,6 +52,14 @@ def run_here(
     code = ended.value.code or 0
     assert isinstance(code, int), code
     return Said(code, said.out, said.err)
+
+
+def done_here(directory: Path, *commands: tuple[str, ...]) -> None:
+    """Run commands in a directory, which must succeed, whatever they say."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(directory)
+        for name, *arguments in commands:
+            assert find_command([name, *arguments]).run(arguments) == 0
 
 
 def commands() -> dict[str, str]:

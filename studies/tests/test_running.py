@@ -38,16 +38,10 @@ def series(**changes: object) -> TrialSeries:
 
 def outcome(computed: Sequence[pd.DataFrame]) -> list[list[object]]:
     """Return what does not depend on the time that it took."""
-    return [
-        [cells for name, cells in frame_columns(table) if name != "mean_sensing_ms"]
-        for table in computed
-    ]
-
-
-def frame_columns(table: pd.DataFrame) -> list[tuple[str, list[object]]]:
-    """Return the columns as lists; equal where equal, with nothing where there is no number."""
-    known = table.astype(object).where(table.notna(), None)
-    return [(name, known[name].tolist()) for name in table.columns]
+    kept = [table.drop(columns="mean_sensing_ms") for table in computed]
+    # Nothing where there is no number, which would not be equal to itself.
+    known = [table.astype(object).where(table.notna(), None) for table in kept]
+    return [[table[name].tolist() for name in table.columns] for table in known]
 
 
 def worker_processes() -> list[int]:

@@ -41,11 +41,6 @@ def _few_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parameters, "_CASES", cases)
 
 
-def selector_of(task: Task) -> dict[str, object]:
-    found: dict[str, object] = task.parameters["planning"]["selector"]
-    return found
-
-
 @pytest.mark.parametrize("study", [selectors.Selectors(), parameters.Parameters()])
 def test_whatever_is_compared_meets_the_same_worlds(study: Study) -> None:
     """Trials are compared pair by pair: of one problem they differ in how it is planned alone."""
@@ -118,7 +113,8 @@ def decided() -> Iterator[Report]:
     def trial(task: Task, number: int) -> tuple[bool, int, float]:
         world = math.exp(0.3 * noise(task, number, ["problem", "model", "seed"]))
         own = math.exp(0.05 * noise(task, number, ["problem", "model", "seed", "planning"]))
-        method, estimator = (selector_of(task)[name] for name in ("method", "estimator"))
+        selector = task.parameters["planning"]["selector"]
+        method, estimator = (selector[name] for name in ("method", "estimator"))
         problem = str(task.parameters["problem"])
         choosing = task.parameters["seed"] == SCALE.seed
         interval = task.parameters["planning"]["sensing_interval"]

@@ -1,13 +1,14 @@
 """``holdfast view``, and ``holdfast run --view-file``: the same steps, and the same decisions."""
 
 import json
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 from rerun.chunk import RrdReader
-from tests.command_line import Said, run_here
+from tests.command_line import Said, done_here, run_here
 
 from holdfast.reports import live_follower, live_view, rerun_streams
 
@@ -19,11 +20,18 @@ simulator: {num_trials: 3, max_steps: 20, seed: 3, sensing_intervals: 4}
 """
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("recorded")
+    (directory / "run.yaml").write_text(RUN)
+    done_here(directory, ("run", "run.yaml", "--out", "run", "-q", "--jobs", "1"))
+    return directory
+
+
 @pytest.fixture
-def here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+def here(tmp_path: Path, recorded: Path) -> Path:
     """Return a directory with a run."""
-    (tmp_path / "run.yaml").write_text(RUN)
-    done(run_here(capsys, tmp_path, "run", "run.yaml", "--out", "run", "-q", "--jobs", "1"))
+    shutil.copytree(recorded, tmp_path, dirs_exist_ok=True)
     return tmp_path
 
 
@@ -43,10 +51,6 @@ def rows(file: Path, path: str) -> list[dict[str, Any]]:
     return sorted(found, key=lambda row: int(row["step"]))
 
 
-def log_of(file: Path) -> list[str]:
-    return [row["TextLog:text"][0] for row in rows(file, "/log")]
-
-
 def summary_of(run: Path) -> Any:
     return json.loads((run / "summary.json").read_text())
 
@@ -62,7 +66,8 @@ class TestARecordedRun:
         said = done(run_here(capsys, here, "view", "run", "--save", "run.rrd"))
         assert said.stdout.startswith("run.rrd  ")
         assert "every step takes 0.1 s" in said.stderr
-        begun = [line for line in log_of(here / "run.rrd") if line.endswith("begins")]
+        log = [row["TextLog:text"][0] for row in rows(here / "run.rrd", "/log")]
+        begun = [line for line in log if line.endswith("begins")]
         assert begun == [f"trial {trial} begins" for trial in range(3)]
         assert sorted(path.name for path in here.iterdir()) == ["run", "run.rrd", "run.yaml"]
 

@@ -387,17 +387,6 @@ class TestKeysAndValues:
         message = complaint(write('problem: peg_in_hole_2d\nsimulator: {seed: "\\e[2J"}'))
         assert "\x1b" not in message
 
-    def test_within_the_lists_of_a_problem(self, write: Write) -> None:
-        holes = "problem: multitier_peg_in_hole_2d\nmodel:\n  holes:\n    - {}\n    - {}\n".format
-        good = "center: [0, 0], tol: 0.1, depth: 1"
-        message = complaint(write(holes(f"{{{good}}}", f"{{{good}, width: 1}}")))
-        assert "line 5: model.holes[1].width is not a known key" in message
-        assert "allowed: center, tol, depth" in message
-        message = complaint(write(holes(f"{{{good}}}", "{center: [0], tol: 0.1, depth: 1}")))
-        assert "model.holes[1].center is [0] (a list of 1); expected a list of 2" in message
-        message = complaint(write(holes("{tol: 0.1, depth: 1}", f"{{{good}}}")))
-        assert "line 4: model.holes[0].center is missing; it has no default" in message
-
     def test_what_is_given_as_an_argument(self, write: Write) -> None:
         message = complaint(write("problem: peg_in_hole_2d\nsimulator: {seed: 3}"), seed=-1)
         assert re.match(
@@ -543,10 +532,6 @@ class TestProblems:
         for name in registry.names():
             assert name in message
 
-    def test_several_told(self, write: Write) -> None:
-        message = complaint(write("model: {peg_width: 1, robot_radius: 0.1}"))
-        assert "belong to capsule_robot and peg_in_hole_2d" in message
-
     def test_unknown(self, write: Write) -> None:
         with pytest.raises(UnknownProblemError) as caught:
             load(write("\nproblem: peg_in_hole_2\n"))
@@ -583,7 +568,3 @@ class TestProblems:
         assert source in message
         assert message.count("  File ") == 1
         assert f'  File "{path.parent / "lamps.py"}", line ' in message
-
-    def test_what_a_problem_itself_refuses(self, write: Write) -> None:
-        message = complaint(write("problem: capsule_robot\nmodel:\n  num_walls: 5"))
-        assert "run.yaml, line 3: model.num_walls" in message

@@ -1,13 +1,12 @@
 """Reading endpoints, and what is refused."""
 
 import socket
-from pathlib import Path
 
 import pytest
 from tests.answers import answers_in
 
 from holdfast.errors import TransportError
-from holdfast.transport.endpoints import Endpoint, TlsFiles, check_credentials, parse_endpoint
+from holdfast.transport.endpoints import Endpoint, parse_endpoint
 
 
 @pytest.mark.parametrize(
@@ -68,18 +67,3 @@ def test_localhost_that_leads_elsewhere_is_not_loopback(monkeypatch: pytest.Monk
     elsewhere = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("10.0.0.7", 0))]
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_: elsewhere)
     assert not parse_endpoint("tcp/localhost:1").is_loopback
-
-
-def test_credentials_go_with_the_protocols_that_use_them(tmp_path: Path) -> None:
-    files = TlsFiles.of(tmp_path)
-    for file in (files.authority, files.certificate, files.key):
-        file.touch()
-    tcp, tls, unix = map(parse_endpoint, ("tcp/localhost:1", "tls/localhost:1", "unix//run/s"))
-    check_credentials(tcp, None)
-    check_credentials(tls, files)
-    check_credentials(unix, None)
-    check_credentials(unix, files)  # a robot has both: its services afar and the local one
-    with pytest.raises(TransportError, match="tls needs credentials"):
-        check_credentials(tls, None)
-    with pytest.raises(TransportError, match="tcp does not use the credentials"):
-        check_credentials(tcp, files)

@@ -23,10 +23,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.typesys import Stores, get_typestore
 from tests.answers import answers_in
-from tests.command_line import Said, run_here
+from tests.command_line import Said, done_here, run_here
 
 import holdfast as hf
-from holdfast.cli.application import find_command
 from holdfast.config.loader import Configuration, load
 from holdfast.config.registry import BUILT_IN
 from holdfast.errors import UntrustedCodeError
@@ -43,7 +42,6 @@ problem: peg_in_hole_2d
 particle_filter: {num_particles: 25}
 simulator: {num_trials: 2, max_steps: 20, sensing_intervals: 3, seed: 5}
 """
-PROBLEMS = tuple(BUILT_IN)
 
 OWN_PROBLEM = '''
 import numpy as np
@@ -174,7 +172,7 @@ class Place:
         if text == PEG and not options and self._recorded:
             shutil.copytree(self._recorded, run)
             return run
-        said = self.call("run", "run.yaml", "--out", "run", "-q", *options)
+        said = self.call(*RUN, *options)
         assert said.code == code, said.stderr
         return run
 
@@ -190,23 +188,16 @@ class Place:
         return said
 
 
-EXPORT = ("export", "run", "--mcap", "run.mcap", "--csv", "tables", "-q")
-
-
-def make(directory: Path, text: str, *then: tuple[str, ...]) -> Path:
-    """Run a configuration in a directory, and other commands after it."""
-    (directory / "run.yaml").write_text(text)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(directory)
-        for words in (("run", "run.yaml", "--out", "run", "-q"), *then):
-            assert find_command(list(words)).run(list(words[1:])) == 0
-    return directory / "run"
+RUN = ("run", "run.yaml", "--out", "run", "-q")
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a run that tests copy."""
-    return make(tmp_path_factory.mktemp("recorded"), PEG)
+    directory = tmp_path_factory.mktemp("recorded")
+    (directory / "run.yaml").write_text(PEG)
+    done_here(directory, RUN)
+    return directory / "run"
 
 
 @pytest.fixture
@@ -259,21 +250,14 @@ def numbers(pose: Any) -> list[float]:
     return [point.x, point.y, point.z, turn.x, turn.y, turn.z, turn.w]
 
 
-def stamp_ns(header: Any) -> int:
-    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
-
-
-def different_beliefs(seen: list[Seen]) -> list[Belief]:
-    """Return the beliefs of trials in order; after sensing it is the same as when acting."""
-    return [belief for observer in seen for *_, belief in observer.beliefs]
-
-
-@pytest.fixture(scope="module", params=PROBLEMS)
+@pytest.fixture(scope="module", params=tuple(BUILT_IN))
 def built_in(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Configuration, Path, list[Seen]]]:
     directory = tmp_path_factory.mktemp("built_in")
-    make(directory, PEG.replace("peg_in_hole_2d", request.param), EXPORT)
+    export = ("export", "run", "--mcap", "run.mcap", "--csv", "tables", "-q")
+    (directory / "run.yaml").write_text(PEG.replace("peg_in_hole_2d", request.param))
+    done_here(directory, RUN, export)
     configuration = load(directory / "run.yaml")
     yield configuration, directory, seen_in(configuration, range(2))
 
@@ -293,14 +277,16 @@ class TestReadBack:
         messages = messages_in(directory, read)
         clouds = of_topic(messages, "/holdfast/particle_cloud")
         tables = of_topic(messages, "/holdfast/belief")
-        expected = different_beliefs(seen)
+        # After sensing it is the same as when acting.
+        expected = [belief for observer in seen for *_, belief in observer.beliefs]
         assert len(clouds) == len(tables) == len(expected) > 40
         layout = layout_of(configuration)
         for cloud, table, belief in zip(clouds, tables, expected, strict=True):
             found = np.array([numbers(pose) for pose in cloud.data.poses])
             assert np.array_equal(found, layout.poses(belief.states))
             assert cloud.data.header.frame_id == "task"
-            assert stamp_ns(cloud.data.header) == cloud.time_ns
+            stamp = cloud.data.header.stamp
+            assert 10**9 * stamp.sec + stamp.nanosec == cloud.time_ns
             particle, coordinates = table.data.layout.dim
             assert (particle.label, particle.size) == ("particle", 25)
             assert coordinates.label.endswith("; weight")
