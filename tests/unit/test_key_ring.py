@@ -8,9 +8,7 @@ import subprocess
 import sys
 import textwrap
 import time
-from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
-from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
@@ -350,9 +348,8 @@ class TestArguments:
             make_credentials(tmp_path, robots=["c", "d"], services=["e"])
 
 
-@pytest.fixture
-def keys(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., Said]:
-    return partial(run_here, capsys, tmp_path.parent, "keys", str(tmp_path))
+def run_keys(capsys: pytest.CaptureFixture[str], home: Path, *arguments: str) -> Said:
+    return run_here(capsys, home.parent, "keys", str(home), *arguments)
 
 
 KILLED_AT_EACH_MOMENT = """
@@ -464,9 +461,11 @@ class TestCommand:
         assert serials[0] == before
         assert serials[2] == certificate_of(tmp_path / "anna").serial_number
 
-    def test_it_makes_keys_and_says_what_goes_where(self, keys: Any, tmp_path: Path) -> None:
-        home = tmp_path
-        done = keys("--host", "10.0.0.7", "--days", "30")
+    def test_it_makes_keys_and_says_what_goes_where(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ) -> None:
+        home = tmp_path / "keys"
+        done = run_keys(capsys, home, "--host", "10.0.0.7", "--days", "30")
         assert (done.code, done.stderr) == (0, "")
         assert f"{home / 'authority' / 'authority.key'} stays here" in done.stdout
         assert f"--tls {home / 'service'}" in done.stdout
@@ -474,18 +473,22 @@ class TestCommand:
         assert "--service tls/10.0.0.7:7447" in done.stdout
         load_credentials(home / "service", "service")
 
-    def test_again_it_refuses_and_renews_if_told_to(self, keys: Any, tmp_path: Path) -> None:
-        assert keys().code == 0
-        done = keys()
+    def test_again_it_refuses_and_renews_if_told_to(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ) -> None:
+        assert run_keys(capsys, tmp_path).code == 0
+        done = run_keys(capsys, tmp_path)
         assert done.code == 2
         assert done.stderr.startswith("holdfast: error: ")
         assert "service/certificate.pem: exists already" in done.stderr
-        done = keys("--renew")
+        done = run_keys(capsys, tmp_path, "--renew")
         assert done.code == 0
         assert f"{tmp_path / 'robot' / 'certificate.pem'} for robot 'robot'" in done.stdout
 
-    def test_names_are_repeated_options(self, keys: Any, tmp_path: Path) -> None:
-        done = keys("--robot", "a", "--robot", "b", "--service", "c")
+    def test_names_are_repeated_options(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ) -> None:
+        done = run_keys(capsys, tmp_path, "--robot", "a", "--robot", "b", "--service", "c")
         assert done.code == 0
         assert {path.name for path in tmp_path.iterdir()} == {"authority", "a", "b", "c"}
         # Each has its own command.
