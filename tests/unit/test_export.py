@@ -33,7 +33,7 @@ from holdfast.journal.journal import Journal
 from holdfast.planning.belief import Belief
 from holdfast.planning.inputs import ActingRecord, Moved, Sensed, encode_floats
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.planner import Planner
+from holdfast.planning.planner import Planner, PlanningState
 from holdfast.reports.poses import PoseLayout, pose_layout
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 
@@ -97,46 +97,34 @@ class World:
 """
 
 
-class Step(NamedTuple):
-    """What one step was, as an observer of the run itself saw it."""
-
-    trial: int
-    step: int
-    belief: Belief
-    true_state: np.ndarray
-    action: np.ndarray
-
-
 class Seen(TrialObserver):
-    """Keeps all of a trial."""
+    """Keeps all of a trial; the truths are those before each task action, and the last."""
 
     def __init__(self) -> None:
-        self.steps: list[Step] = []
         self.sensed_steps: list[SensingStep] = []
-        self.last: tuple[int, int, Belief, np.ndarray] | None = None
+        self.task_steps: list[TaskStep] = []
+        self.truths: list[np.ndarray] = []
         self.beliefs: list[tuple[int, int, str, Belief]] = []
-        self._true: Any = None
         self._environment: Any = None
 
     def trial_began(self, environment: Any, state: Any) -> None:
         self._environment = environment
-        self._true = environment.state.copy()
+        self.truths.append(environment.state.copy())
 
     def sensed(self, step: SensingStep) -> None:
         self.sensed_steps.append(step)
-        self.beliefs.append((step.before.trial, step.before.step, "sensing", step.before.belief))
+        self.note("sensing", step.before)
 
     def acted(self, step: TaskStep) -> None:
-        state = step.state
-        self.steps.append(
-            Step(state.trial, state.step, state.belief, self._true, step.executed.copy())
-        )
-        self.beliefs.append((state.trial, state.step, "acting", state.belief))
-        self._true = self._environment.state.copy()
+        self.task_steps.append(step)
+        self.note("acting", step.state)
+        self.truths.append(self._environment.state.copy())
 
     def trial_ended(self, state: Any, result: TrialResult) -> None:
-        self.last = (state.trial, state.step, state.belief, self._true)
-        self.beliefs.append((state.trial, state.step, "end", state.belief))
+        self.note("end", state)
+
+    def note(self, when: str, state: PlanningState) -> None:
+        self.beliefs.append((state.trial, state.step, when, state.belief))
 
 
 def seen_in(configuration: Configuration, trials: range) -> list[Seen]:
@@ -298,14 +286,10 @@ class TestReadBack:
         configuration, directory, seen = built_in
         messages = messages_in(directory, read)
         layout = layout_of(configuration)
-        rows = [
-            row
-            for observer in seen
-            for row in [
-                *((step.belief, step.true_state) for step in observer.steps),
-                observer.last[2:],
-            ]
-        ]
+        rows: list[tuple[Belief, np.ndarray]] = []
+        for observer in seen:
+            beliefs = [belief for *_, when, belief in observer.beliefs if when != "sensing"]
+            rows += zip(beliefs, observer.truths, strict=True)
         estimates = of_topic(messages, "/holdfast/estimate")
         truths = of_topic(messages, "/holdfast/truth")
         transforms = of_topic(messages, "/tf")
@@ -330,7 +314,7 @@ class TestReadBack:
         configuration, directory, seen = built_in
         messages = messages_in(directory, read)
         sensed = [step for observer in seen for step in observer.sensed_steps]
-        actions = [step.action.tolist() for observer in seen for step in observer.steps]
+        actions = [step.executed.tolist() for observer in seen for step in observer.task_steps]
         chosen = [message.data.data for message in of_topic(messages, "/holdfast/sensing_action")]
         assert chosen == [step.sensing_action for step in sensed]
         labels = [
@@ -358,8 +342,7 @@ class TestReadBack:
             if following is None or len(following.data.poses) < len(path.data.poses)
         ]
         for observer, end in zip(seen, ends, strict=True):
-            way = [step.true_state for step in observer.steps] + [observer.last[3]]
-            assert end == layout.poses(way).tolist()
+            assert end == layout.poses(observer.truths).tolist()
 
     def test_tables(self, built_in: Any) -> None:
         configuration, directory, seen = built_in
@@ -677,12 +660,12 @@ class TestUnfinished:
         (run / "journal.bin").unlink()
         records: list[Any] = []
         sensed = {step.before.step: step for step in seen.sensed_steps}
-        for step in seen.steps[:7]:
-            if step.step in sensed:
-                records.append(sensed[step.step].sensed)
-            if step.step < 6:
-                records.append(ActingRecord(step.step, step.action.tobytes()))
-                records.append(Moved(step.step, None))
+        for number, step in enumerate(seen.task_steps[:7]):
+            if number in sensed:
+                records.append(sensed[number].sensed)
+            if number < 6:
+                records.append(ActingRecord(number, step.executed.tobytes()))
+                records.append(Moved(number, None))
         assert isinstance(records[-1], Sensed) == (6 in sensed)
         with Journal.create(run / "journal.bin", meta) as journal:
             journal.add(first)
@@ -692,9 +675,9 @@ class TestUnfinished:
         rows = [row for row in rows_of(tmp_path / "tables" / "steps.csv") if row["trial"] == "1"]
         performed = [row for row in rows if row["action_time"]]
         assert len(performed) == 6
-        for row, step in zip(performed, seen.steps, strict=False):
+        for row, truth in zip(performed, seen.truths, strict=False):
             labels = configuration.problem.state_labels
-            assert [float(row[f"true {label}"]) for label in labels] == step.true_state.tolist()
+            assert [float(row[f"true {label}"]) for label in labels] == truth.tolist()
         tables = of_topic(by_mcap(tmp_path / "run.mcap"), "/holdfast/belief")
         last = np.array(tables[-1].data.data).reshape(25, 4)
         if 6 in sensed:
