@@ -37,8 +37,11 @@ def _few_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(selectors, "INTERVALS", few)
     each_and_all = (*((interval, (interval,)) for interval in few), ("mean", few))
     monkeypatch.setattr(selectors, "_EACH_AND_ALL", each_and_all)
-    cases = {name: parameters._CASES[name] for name in ("tight hole", "peg in space", "passer-by")}
-    monkeypatch.setattr(parameters, "_CASES", cases)
+    names = ("tight hole", "peg in space", "passer-by")
+    for module in (selectors, parameters):
+        cases = {name: module._CASES[name] for name in names}
+        monkeypatch.setattr(module, "_CASES", cases)
+    monkeypatch.setattr(selectors, "GROUPS", dict.fromkeys(selectors.GROUPS, names))
 
 
 @pytest.mark.parametrize("study", [selectors.Selectors(), parameters.Parameters()])

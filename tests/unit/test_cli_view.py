@@ -143,6 +143,7 @@ def test_what_cannot_be_shown(
 ) -> None:
     if words[0] == "view":
         monkeypatch.setattr(rerun_streams, "_listens", lambda _: False)
+    monkeypatch.setattr(live_view, "_START_S", 600.0)
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     said = run_here(capsys, here, *words)
