@@ -40,7 +40,7 @@ class Service(socketserver.ThreadingTCPServer):
 
 
 @contextlib.contextmanager
-def served(service: socketserver.BaseServer) -> Iterator[int]:
+def served(service: socketserver.TCPServer) -> Iterator[int]:
     """Serve, and return the port."""
     with service:
         thread = threading.Thread(target=service.serve_forever, args=(0.01,))
