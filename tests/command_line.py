@@ -14,7 +14,7 @@ import pytest
 
 from holdfast.cli import main
 from holdfast.cli.added_commands import added_commands
-from holdfast.cli.application import COMMANDS
+from holdfast.cli.application import COMMANDS, find_command
 from holdfast.runtime.command_line import Options
 
 
@@ -106,6 +106,14 @@ class Workplace:
     def summary(self, out: str) -> dict[str, object]:
         found: dict[str, object] = json.loads((self.directory / out / "summary.json").read_text())
         return found
+
+
+def done_here(directory: Path, *commands: tuple[str, ...]) -> None:
+    """Run commands in a directory, which must succeed, whatever they say."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(directory)
+        for name, *arguments in commands:
+            assert find_command([name, *arguments]).run(arguments) == 0
 
 
 def commands() -> dict[str, str]:

@@ -3,8 +3,6 @@
 What it makes of two runs: lab/tests/test_chaos_trial.py.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -20,15 +18,14 @@ from pathlib import Path
 import msgspec
 import pytest
 from tests.command_line import run_here
+from tests.marked_command import PATIENCE_S, MarkedCommand
 from tests.process_states import state_of
 
 from holdfast_lab.chaos.schedule import WIRES, Schedule, Wire, kinds_over
 from holdfast_lab.chaos.trial import Pace, TrialOutcome, run_chaos_trial
 from holdfast_lab.testbed.faults import NEEDS_NAMESPACE, Fault, FaultKind
-from holdfast_lab.testbed.processes import marked_processes
 from holdfast_lab.testbed.world import performances
 
-PATIENCE_S = 240.0
 COMMAND = (sys.executable, "-m", "holdfast", "chaos")
 BRIEF = Pace(min_steps=60, rate_hz=60.0)
 
@@ -110,49 +107,9 @@ def test_a_run_that_does_not_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert not Path(f"/proc/{mark}").exists()
 
 
-class Chaos:
-    """The command, as a process that is the leader of nothing but itself."""
-
-    def __init__(self, directory: Path, *arguments: str, program: str | None = None) -> None:
-        self.out = directory / "out"
-        self._mark = f"{directory}"
-        command = COMMAND if program is None else (sys.executable, "-c", program, "chaos")
-        self.process = subprocess.Popen(
-            [*command, "--out", str(self.out), *arguments],
-            cwd=directory,
-            env={**os.environ, "HOLDFAST_TEST_CHAOS": self._mark},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
-
-    def others(self) -> list[int]:
-        found = marked_processes("HOLDFAST_TEST_CHAOS", self._mark)
-        return [pid for pid in found if pid != self.process.pid]
-
-    def wait_until(self, what: str, *, present: bool) -> None:
-        """Wait until a command line has something in it, or no process is left."""
-        deadline = time.monotonic() + PATIENCE_S
-        while any(what in _command_of(pid) for pid in self.others()) != present:
-            assert time.monotonic() < deadline, f"{what}: {self.others()}"
-            time.sleep(0.02)
-
-    def end(self) -> tuple[str, str]:
-        return self.process.communicate(timeout=PATIENCE_S)
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.communicate()
-        for pid in self.others():
-            os.kill(pid, signal.SIGKILL)
-
-
-def _command_of(pid: int) -> str:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
-    except OSError:
-        return ""
+class Chaos(MarkedCommand):
+    def __init__(self, directory: Path, *arguments: str) -> None:
+        super().__init__(directory, "chaos", *arguments)
 
 
 @pytest.fixture
@@ -176,7 +133,7 @@ def test_every_kind_of_fault(tmp_path: Path, started: list[Chaos], wire: Wire) -
     started.append(chaos)
     output, errors = chaos.end()
     assert chaos.process.returncode == 0, output + errors
-    assert chaos.others() == []
+    assert not chaos.others()
     assert sorted(path.name for path in chaos.out.iterdir()) == [
         "summary.json",
         "table.txt",
@@ -219,7 +176,7 @@ def test_an_interruption_ends_all_processes_and_the_series_goes_on(
     chaos.process.send_signal(signal.SIGINT)
     _, errors = chaos.end()
     assert chaos.process.returncode == 130
-    assert chaos.others() == []
+    assert not chaos.others()
     assert "Interrupted; all processes are ended. 1 of 3 trials are finished" in errors
     again = re.search(r"Go on with: (holdfast chaos .*)", errors)
     assert again is not None
@@ -261,10 +218,7 @@ def test_nothing_is_left_of_it_even_if_it_is_killed(tmp_path: Path, started: lis
         (("--only", "earthquake"), "--only is 'earthquake'; allowed are cloud_killed, "),
         (("--only", "link-slient"), "; did you mean link_silent?"),
         (("--wire", "token_ring"), f"--wire is 'token_ring'; allowed are {', '.join(WIRES)}"),
-        (
-            ("--kinds", "cloud_killed"),
-            "is no option of holdfast chaos; did you mean --kind?",
-        ),
+        (("--kinds", "cloud_killed"), "is no option of holdfast chaos; did you mean --kind?"),
     ],
 )
 def test_what_is_no_kind_is_refused(

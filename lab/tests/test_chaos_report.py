@@ -1,7 +1,5 @@
 """What is made of the outcomes of a series: rows, a summary and a table; and how a series runs."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What is drawn for a chaos trial: the same from the same numbers, and only what can be done."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import msgspec

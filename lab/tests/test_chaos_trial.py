@@ -1,7 +1,5 @@
 """The verdict of a trial of ``holdfast chaos`` over its two runs."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path

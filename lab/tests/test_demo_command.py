@@ -1,89 +1,42 @@
-"""``holdfast demo`` as CI runs it: the whole story, and its end when something is in the way.
+"""``holdfast demo`` as CI runs it: the whole story, and its end when something is in the way."""
 
-Whatever the demo starts inherits a mark in its environment, so the test finds all of it, the
-robot's own local service too, without asking the demo.
-"""
-
-from __future__ import annotations
-
-import contextlib
 import os
 import re
 import signal
-import subprocess
-import sys
 import tempfile
 import threading
 import time
-import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
 
 import pytest
+from tests.marked_command import MarkedCommand
 
 from holdfast.reports.compare import compare_runs
-from holdfast_lab.testbed.processes import marked_processes
 
-COMMAND = [sys.executable, "-c", "from holdfast.cli import main; main()"]
-MARK = "HOLDFAST_TEST_MARK"
-PATIENCE_S = 240.0
 ATTEMPTS = 3
 STANDSTILL_S = 0.1
 """The shortest that is told from a machine that is merely busy; a service has 0.25 s."""
 
 
-class Demo:
-    """A demo that is going on, without a terminal."""
+class Demo(MarkedCommand):
+    """A demo that is going on."""
 
-    def __init__(self, directory: Path, *arguments: str) -> None:
-        self.mark = uuid.uuid4().hex
-        self.out = directory / "out"
-        temporary = directory / "tmp"
-        temporary.mkdir()
-        self.temporary = temporary
-        self.process = subprocess.Popen(
-            [*COMMAND, "demo", "--quick", "--out", str(self.out), *arguments],
-            cwd=directory,
-            env={**os.environ, MARK: self.mark, "TMPDIR": str(temporary)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
+    def __init__(self, directory: Path) -> None:
+        self.temporary = directory / "tmp"
+        self.temporary.mkdir()
+        super().__init__(directory, "demo", "--quick", TMPDIR=str(self.temporary))
 
-    def others(self) -> dict[int, str]:
-        """Processes that live and came from the demo, by what they were asked to do."""
-        found = {}
-        for pid in marked_processes(MARK, self.mark):
-            with contextlib.suppress(OSError):
-                command = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
-                found[pid] = command
-        found.pop(self.process.pid, None)
-        return found
-
-    def read_until(self, text: str) -> str:
+    def read_until(self, text: str) -> None:
         """Read the lines of the story up to the first one with this text in it."""
         assert self.process.stderr is not None
         lines = ""
         for line in self.process.stderr:
             lines += line
             if text in line:
-                return lines
+                return
         raise AssertionError(f"{text!r} is not in\n{lines}")
-
-    def wait_until_all_are_gone(self) -> None:
-        """The local service ends by itself, a moment after the robot."""
-        deadline = time.monotonic() + 60.0
-        while left := self.others():
-            assert time.monotonic() < deadline, f"left: {left}"
-            time.sleep(0.05)
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.communicate()
-        for pid in self.others():
-            os.kill(pid, signal.SIGKILL)
 
 
 @pytest.fixture
@@ -139,9 +92,9 @@ def told(directory: Path) -> tuple[Demo, str, str]:
         with Standstill() as standstill:
             demo = Demo(place)
             try:
-                output, story = demo.process.communicate(timeout=PATIENCE_S)
+                output, story = demo.end()
                 assert demo.process.returncode == 0, output + story
-                demo.wait_until_all_are_gone()
+                demo.wait_until("", present=False)  # the local service ends after the robot
             finally:
                 demo.close()
         # With the usual timeouts a machine that stands still is taken for a dead service.
@@ -197,10 +150,10 @@ def test_an_interruption_ends_all_processes(directory: Path) -> None:
         assert sum(" run " in command for command in before.values()) == 1
         assert sum("recovery" in command for command in before.values()) == 1
         demo.process.send_signal(signal.SIGINT)
-        _, rest = demo.process.communicate(timeout=PATIENCE_S)
+        _, rest = demo.end()
         assert demo.process.returncode == 130
         assert rest.endswith(f"Interrupted; all processes are ended. The logs are in {demo.out}\n")
-        assert demo.others() == {}
+        assert not demo.others()
         assert list(demo.temporary.iterdir()) == []
     finally:
         demo.close()
@@ -214,12 +167,12 @@ def test_a_process_that_ends_by_itself_ends_the_demo(directory: Path) -> None:
         robots = [pid for pid, command in demo.others().items() if " run " in command]
         assert len(robots) == 1
         os.kill(robots[0], signal.SIGKILL)
-        output, rest = demo.process.communicate(timeout=PATIENCE_S)
+        output, rest = demo.end()
         assert demo.process.returncode == 2
         assert "holdfast: error: the robot ended with SIGKILL; see " in rest
         assert str(demo.out / "robot.log") in rest
         assert (demo.out / "robot.log").exists()
         assert "identical" not in output
-        demo.wait_until_all_are_gone()
+        demo.wait_until("", present=False)  # the local service ends after the robot
     finally:
         demo.close()

@@ -1,7 +1,5 @@
 """The demo's timeline and its findings as text, without a terminal."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Any

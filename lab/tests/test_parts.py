@@ -1,7 +1,5 @@
 """The parts of the simulated world, each by itself: one that lies would prove nothing."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest
@@ -97,27 +95,6 @@ def result(steps: int, digest: str) -> TrialResult:
 
 class TestEnvironmentModel:
     @pytest.mark.parametrize(
-        ("step", "value", "says"),
-        [
-            (0, 0.0, "performed again, where 1"),
-            (2, 2.0, "performed, where 1"),
-            (1, np.nextafter(1.0, 2.0), "the undisturbed run has"),
-        ],
-    )
-    def test_another_task_action(self, step: int, value: float, says: str) -> None:
-        world = environment()
-        world.act(0, np.zeros(2))
-        with pytest.raises(Violation, match=says):
-            world.act(step, np.full(2, value))
-
-    def test_another_sensing_action(self) -> None:
-        world = environment()
-        with pytest.raises(Violation, match="the undisturbed run has 0"):
-            world.sense(0, 1)
-        with pytest.raises(Violation, match="where 0 task actions"):
-            world.sense(1, 0)
-
-    @pytest.mark.parametrize(
         ("shows_the_same", "ends"), [(True, "digest"), (False, "digest((0, 2),)")]
     )
     def test_what_is_sensed_again(self, shows_the_same: bool, ends: str) -> None:
@@ -152,57 +129,59 @@ def reply(tag: int) -> bytes:
     return bytes(msgspec.msgpack.encode([tag, 1])) + b"sum!"
 
 
+class Wire(WireChecker):
+    """One that is told of all that happens to a request."""
+
+    def carry(self, call: int, payload: bytes, *, as_: bytes = b"") -> None:
+        self.requested(call, payload)
+        self.arrived("cloud-1", 1, call)
+        self.taken("cloud-1", 1, call, as_ or payload)
+
+    def answer(self, call: int, tag: int) -> None:
+        self.replied("cloud-1", 1, call, reply(tag))
+
+
 class TestWireChecker:
     def test_a_stale_epoch_is_not_answered(self) -> None:
-        checker = WireChecker()
+        checker = Wire()
         for call, epoch in ((1, 1), (2, 2)):
-            checker.requested(call, request(epoch))
-            checker.arrived("cloud-1", 1, call)
-            checker.taken("cloud-1", 1, call, request(epoch))
-        checker.replied("cloud-1", 1, 2, reply(1))
-        checker.replied("cloud-1", 1, 1, reply(6))  # to refuse it is right
+            checker.carry(call, request(epoch))
+        checker.answer(2, 1)
+        checker.answer(1, 6)  # to refuse it is right
         with pytest.raises(Violation, match="of epoch 1, after one of epoch 2"):
-            checker.replied("cloud-1", 1, 1, reply(1))
+            checker.answer(1, 1)
 
     def test_a_damaged_request_is_not_answered(self) -> None:
-        checker = WireChecker()
-        checker.requested(1, request(1))
-        checker.arrived("cloud-1", 1, 1)
-        checker.taken("cloud-1", 1, 1, request(3))
-        checker.replied("cloud-1", 1, 1, reply(6))
+        checker = Wire()
+        checker.carry(1, request(1), as_=request(3))
+        checker.answer(1, 6)
         with pytest.raises(Violation, match="which was damaged"):
-            checker.replied("cloud-1", 1, 1, reply(2))
+            checker.answer(1, 2)
 
     def test_an_end_is_the_end(self) -> None:
-        checker = WireChecker()
-        checker.requested(1, request(1))
-        checker.arrived("cloud-1", 1, 1)
-        checker.taken("cloud-1", 1, 1, request(1))
+        checker = Wire()
+        checker.carry(1, request(1))
         checker.ended("cloud-1", 1)
         with pytest.raises(Violation, match="after its end"):
-            checker.replied("cloud-1", 1, 1, reply(1))
+            checker.answer(1, 1)
         with pytest.raises(Violation, match="ends call 1 again"):
             checker.ended("cloud-1", 1)
 
     def test_calls_are_ended_and_few(self) -> None:
-        checker = WireChecker()
+        checker = Wire()
         checker.open_calls(8)
         with pytest.raises(Violation, match="9 calls open to one service: allowed are 8"):
             checker.open_calls(9)
         with pytest.raises(Violation, match="that it has not ended"):
             for call in range(1000):
-                checker.requested(call, request(1))
-                checker.arrived("cloud-1", 1, call)
-                checker.taken("cloud-1", 1, call, request(1))
+                checker.carry(call, request(1))
 
     def test_other_robots_have_epochs_of_their_own(self) -> None:
-        checker = WireChecker()
+        checker = Wire()
         other = bytes(msgspec.msgpack.encode([2, b"t", 1, 1])) + b"sum!"
         for call, payload in ((1, request(7)), (2, other)):
-            checker.requested(call, payload)
-            checker.arrived("cloud-1", 1, call)
-            checker.taken("cloud-1", 1, call, payload)
-            checker.replied("cloud-1", 1, call, reply(1))
+            checker.carry(call, payload)
+            checker.answer(call, 1)
 
 
 def test_what_grows_is_found_wherever_it_is() -> None:

@@ -1,7 +1,5 @@
 """``holdfast simulate``, as whoever types it sees it."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 from typing import Protocol

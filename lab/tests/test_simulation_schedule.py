@@ -1,8 +1,7 @@
 """Schedules: what is drawn can be written down and read back, and what is none is refused."""
 
-from __future__ import annotations
-
 import pytest
+from tests.answers import answers_in
 
 from holdfast_lab.errors import ScheduleError
 from holdfast_lab.simulation.schedule import (
@@ -63,25 +62,7 @@ def test_text_is_as_short_as_it_can_be() -> None:
     assert parse_schedule("") == SimulationSchedule(RunSettings())
 
 
-@pytest.mark.parametrize(
-    ("line", "says"),
-    [
-        ("crush service=cloud-1 at=1", "'crush' is none of crash, crowd, cut, disk_stall, "),
-        ("crash service=cloud-1", "missing required field `at`"),
-        ("crash service=cloud-1 at=soon", "Expected `float`, got `str` - at `$.at`"),
-        ("crash service=cloud-1 at=-1", "Expected `float` >= 0.0 - at `$.at`"),
-        ("crash service=cloud-1 at", "'at' is not one value of the form key=value"),
-        ("crash at=1 at=2 service=local", "'at=2' is not one value"),
-        ("crash service=moon at=1", "at `$.service`"),
-        ("crash service=cloud-1 at=1 color=red", "unknown field `color`"),
-        ("crash service=cloud-3 at=1", "there is no cloud-3 in a run with 1 replicas"),
-        ("run trial=1\nrun trial=2", "2 lines begin with 'run': allowed is 1"),
-        (
-            "message service=local direction=to number=1 what=misroute",
-            "a misrouted message must be a reply",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("line", "says"), answers_in("schedule_mistakes.txt"))
 def test_what_is_no_schedule_is_refused(line: str, says: str) -> None:
     with pytest.raises(ScheduleError) as raised:
         parse_schedule(line)

@@ -1,7 +1,5 @@
 """What a bad line does to datagrams and packets, whatever its ends are."""
 
-from __future__ import annotations
-
 import queue
 
 import pytest

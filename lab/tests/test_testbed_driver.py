@@ -1,7 +1,5 @@
 """The testbed's loop, its scripts, and how its processes end."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

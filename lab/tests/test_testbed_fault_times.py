@@ -1,7 +1,5 @@
 """How long reactions took: from made-up events and tables, with known times."""
 
-from __future__ import annotations
-
 import pytest
 
 from holdfast.robot.links import RECOVERY_SERVICE as LOCAL

@@ -1,7 +1,5 @@
 """The machine of a measurement, by name."""
 
-from __future__ import annotations
-
 from holdfast import _kernel
 from holdfast_lab.testbed.machine import describe, kernel_hash
 

@@ -1,7 +1,5 @@
 """A network of one's own, where this machine permits it; and what is said where it does not."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 

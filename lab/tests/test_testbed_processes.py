@@ -1,7 +1,5 @@
 """What a command as a process of its own can be made to do, and how it is found."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,9 +1,8 @@
 """The bad line: what it does to bytes, and what it never does. No time is asserted."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
+import socketserver
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -19,51 +18,54 @@ BRIEFLY_S = 0.15
 """Long enough for what comes through to come; if a machine is slower, a test only sees less."""
 
 
-class Echo:
-    """A service that sends back what it gets."""
+class EchoStream(socketserver.BaseRequestHandler):
+    """Sends back what it gets."""
 
-    def __init__(self) -> None:
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port: int = self._listener.getsockname()[1]
-        self.accepted: list[socket.socket] = []
-        self._threads = [threading.Thread(target=self._accept)]
-        self._threads[0].start()
-
-    def _accept(self) -> None:
+    def handle(self) -> None:
         with contextlib.suppress(OSError):
-            while True:
-                accepted, _ = self._listener.accept()
-                self.accepted.append(accepted)
-                self._threads.append(threading.Thread(target=self._serve, args=(accepted,)))
-                self._threads[-1].start()
-
-    @staticmethod
-    def _serve(accepted: socket.socket) -> None:
-        with contextlib.suppress(OSError), accepted:
-            while data := accepted.recv(65536):
-                accepted.sendall(data)
-
-    def close(self) -> None:
-        self._listener.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
-        for accepted in self.accepted:
-            with contextlib.suppress(OSError):
-                accepted.shutdown(socket.SHUT_RDWR)
-            accepted.close()
-        for thread in self._threads:
-            thread.join(PATIENCE_S)
+            while data := self.request.recv(65536):
+                self.request.sendall(data)
 
 
-@pytest.fixture
-def echo() -> Iterator[Echo]:
-    with contextlib.closing(Echo()) as echo:
-        yield echo
+class EchoDatagram(socketserver.BaseRequestHandler):
+    """Sends a datagram back to whoever sent it."""
+
+    def handle(self) -> None:
+        content, own = self.request
+        own.sendto(content, self.client_address)
+
+
+class Service(socketserver.ThreadingTCPServer):
+    daemon_threads = True
+
+
+@contextlib.contextmanager
+def served(service: socketserver.TCPServer) -> Iterator[int]:
+    """Serve, and return the port."""
+    with service:
+        thread = threading.Thread(target=service.serve_forever, args=(0.01,))
+        thread.start()
+        yield int(service.socket.getsockname()[1])
+        service.shutdown()
+        thread.join(PATIENCE_S)
 
 
 @pytest.fixture
-def proxy(echo: Echo) -> Iterator[tuple[Proxy, int]]:
+def echo() -> Iterator[int]:
+    with served(Service(("127.0.0.1", 0), EchoStream)) as port:
+        yield port
+
+
+@pytest.fixture
+def datagram_echo() -> Iterator[int]:
+    with served(socketserver.UDPServer(("127.0.0.1", 0), EchoDatagram)) as port:
+        yield port
+
+
+@pytest.fixture
+def proxy(echo: int) -> Iterator[tuple[Proxy, int]]:
     port = free_port()
-    with Proxy(port, echo.port, "seed") as proxy:
+    with Proxy(port, echo, "seed") as proxy:
         yield proxy, port
 
 
@@ -177,36 +179,6 @@ def test_impairments_add_up(proxy: tuple[Proxy, int]) -> None:
         assert received(connection, 1) == b"a"
 
 
-class DatagramEcho:
-    """A service that sends datagrams back to whoever sent them."""
-
-    def __init__(self) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind(("127.0.0.1", 0))
-        self.port: int = self._socket.getsockname()[1]
-        self._thread = threading.Thread(target=self._serve)
-        self._thread.start()
-
-    def _serve(self) -> None:
-        while True:
-            content, address = self._socket.recvfrom(65_536)
-            if not content:
-                return
-            self._socket.sendto(content, address)
-
-    def close(self) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as last:
-            last.sendto(b"", ("127.0.0.1", self.port))
-        self._thread.join(PATIENCE_S)
-        self._socket.close()
-
-
-@pytest.fixture
-def datagram_echo() -> Iterator[DatagramEcho]:
-    with contextlib.closing(DatagramEcho()) as echo:
-        yield echo
-
-
 def client_of(port: int) -> socket.socket:
     client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     client.connect(("127.0.0.1", port))
@@ -223,12 +195,9 @@ def datagram_line(port: int, target: int, latency_s: float, loss: float) -> Iter
 
 class TestDatagrams:
     @pytest.mark.parametrize("direction", ["both", "to_service", "to_robot"])
-    def test_silence_swallows_them(self, datagram_echo: DatagramEcho, direction: Any) -> None:
+    def test_silence_swallows_them(self, datagram_echo: int, direction: Any) -> None:
         port = free_port()
-        with (
-            datagram_line(port, datagram_echo.port, 0.0, 0.0) as proxy,
-            client_of(port) as client,
-        ):
+        with datagram_line(port, datagram_echo, 0.0, 0.0) as proxy, client_of(port) as client:
             heal = proxy.impair(Impairment(silent=True, direction=direction))
             client.send(b"lost")
             assert not comes_briefly(client)
@@ -236,15 +205,11 @@ class TestDatagrams:
             client.send(b"heard")
             assert client.recv(100) == b"heard"
 
-    def test_streams_and_datagrams_are_cut_apart(self, datagram_echo: DatagramEcho) -> None:
+    def test_streams_and_datagrams_are_cut_apart(self, datagram_echo: int) -> None:
         port = free_port()
         heard: list[tuple[str, str, bytes]] = []
         proxy = Proxy(
-            port,
-            datagram_echo.port,
-            "seed",
-            datagrams=True,
-            overhear=lambda *each: heard.append(each),
+            port, datagram_echo, "seed", datagrams=True, overhear=lambda *each: heard.append(each)
         )
         with proxy, client_of(port) as client:
             proxy.impair(Impairment(cut=True, carriers=("streams",)))

@@ -1,7 +1,5 @@
 """A robot and a service far from each other: which paths there are, and that nothing is changed."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from typing import Any
@@ -47,8 +45,7 @@ def test_the_same_machine_needs_no_path() -> None:
 
 
 @pytest.mark.parametrize(
-    ("transport", "way"),
-    [("tcp", "tcp proxy"), ("tls", "tcp proxy"), ("udp", "datagram proxy")],
+    ("transport", "way"), [("tcp", "tcp proxy"), ("tls", "tcp proxy"), ("udp", "datagram proxy")]
 )
 def test_where_no_networks_can_be_had_there_is_a_proxy(transport: Any, way: str) -> None:
     with lay_route(transport, 20.0, 0.01, "seed", packets=False) as path:

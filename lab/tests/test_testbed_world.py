@@ -1,7 +1,5 @@
 """The world that is a file: it outlives whoever acts on it, and tells of every wrong."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Results that were not computed but made up, so that what is made of them is known."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Sequence
 from functools import cache

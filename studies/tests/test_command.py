@@ -7,6 +7,7 @@ from pathlib import Path
 from time import monotonic, sleep
 
 import pytest
+from tests.answers import answers_in
 
 from holdfast.errors import InvalidValueError, OptionError
 from studies.command import main, studies_of, study_names
@@ -22,22 +23,11 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["published"], "study 'published': .* did you mean published_2017"),
-        ([], "NAME is missing"),
-        (["all", "--jobs", "-1"], "--jobs is '-1'; allowed are whole numbers from 0 to "),
-        (["all", "--executor", "slurm"], "--executor slurm: must be local, ray "),
-        (["all", "--executor", "ray://"], "--executor ray://: must be local, ray "),
-        (["selectors", "--from", "a.parquet"], "a.parquet: cannot be read: No"),
-        (["selectors", "--quick", "--from", "a"], "--quick has no effect"),
-        (["all", "--executor", "ray", "--jobs", "3"], "--jobs 3: has no effect with .* ray"),
-        (["all", "--list"], "--list shows all; leave all out"),
-    ],
+    ("line", "message"), [*answers_in("study_mistakes.txt"), ("", "NAME is missing")]
 )
-def test_bad_arguments(arguments: list[str], message: str, tmp_path: Path) -> None:
+def test_bad_arguments(line: str, message: str, tmp_path: Path) -> None:
     with pytest.raises((InvalidValueError, OptionError, TrialFileError), match=message):
-        main([*arguments, "--out", str(tmp_path / "out")])
+        main([*line.split(), "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out").exists()
 
 

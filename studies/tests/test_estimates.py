@@ -1,7 +1,5 @@
 """The study of estimates: what it tries, and that its tasks run."""
 
-from __future__ import annotations
-
 from studies.estimates import Estimates
 from studies.study import CHOICE, CLAIM, Scale
 from studies.tasks import run_task

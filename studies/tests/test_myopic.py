@@ -1,7 +1,5 @@
 """The study of problems on which looking one step ahead fails, with results known beforehand."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,21 +1,11 @@
 """What the study of published worlds makes of results that are known beforehand."""
 
-from __future__ import annotations
-
 import pandas as pd
 import pytest
 
 from holdfast.errors import InvalidValueError
-from studies.command import studies_of
 from studies.errors import TaskError
-from studies.published_worlds import (
-    BEST,
-    COLUMNS,
-    WAYS,
-    PublishedWorlds,
-    published_planners,
-    run_vdp_tag,
-)
+from studies.published_worlds import BEST, COLUMNS, PublishedWorlds, published_planners, run_vdp_tag
 from studies.study import TRIALS, Report, Scale
 from studies.tasks import Task
 
@@ -39,11 +29,6 @@ def made_up() -> Report:
     return PublishedWorlds().report(SCALE, result_of)
 
 
-def test_it_is_registered() -> None:
-    (study,) = studies_of(["published_worlds"])
-    assert isinstance(study, PublishedWorlds)
-
-
 def test_published_figures() -> None:
     planners = published_planners()
     names = ["trials", "mean_discounted_reward", "standard_error"]
@@ -59,11 +44,6 @@ def test_other_trials_are_refused(made_up: Report) -> None:
 def test_the_figure_can_be_drawn(made_up: Report) -> None:
     pytest.importorskip("matplotlib")
     assert made_up.figures["vdp_tag"]().axes
-
-
-def test_quick_is_little() -> None:
-    quick = PublishedWorlds().tasks(Scale(quick=True, seed=1))
-    assert sum(task.units for task in quick) == 4 * len(WAYS)
 
 
 def test_tasks_do_not_depend_on_how_they_are_cut() -> None:

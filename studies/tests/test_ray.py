@@ -3,8 +3,6 @@
 Whoever joins it does so in a process of its own, since Ray's client joins only once in each.
 """
 
-from __future__ import annotations
-
 import contextlib
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """The page of results says what the committed results say, and shows what is there."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re
@@ -85,13 +83,6 @@ def test_each_interval_of_a_section_is_in_its_tables(section: str) -> None:
     quoted = list(INTERVAL.finditer(" ".join(section.split())))
     assert quoted
     assert [match[0] for match in quoted if not is_found(match, intervals)] == []
-
-
-def test_a_wrong_interval_is_seen() -> None:
-    match = INTERVAL.search("it takes 0.56 [0.52, 0.60] times")
-    assert match is not None
-    assert is_found(match, [(0.557, 0.521, 0.595)])
-    assert not is_found(match, [(0.57, 0.521, 0.595)])
 
 
 @pytest.mark.parametrize("name", ORIGINS)
@@ -220,14 +211,6 @@ def is_the_same(cell: str, other: str) -> bool:
         return float(cell) == pytest.approx(float(other), rel=1e-9, abs=1e-12)
     except ValueError:
         return cell == other
-
-
-def test_a_number_that_differs_is_seen() -> None:
-    assert is_the_same("0.25", "0.2500000000001")
-    assert is_the_same("", "")
-    assert not is_the_same("0.25", "0.2501")
-    assert not is_the_same("0.25", "")
-    assert not is_the_same("random", "fixed")
 
 
 @pytest.mark.slow

@@ -38,16 +38,10 @@ def series(**changes: object) -> TrialSeries:
 
 def outcome(computed: Sequence[pd.DataFrame]) -> list[list[object]]:
     """Return what does not depend on the time that it took."""
-    return [
-        [cells for name, cells in frame_columns(table) if name != "mean_sensing_ms"]
-        for table in computed
-    ]
-
-
-def frame_columns(table: pd.DataFrame) -> list[tuple[str, list[object]]]:
-    """Return the columns as lists; equal where equal, with nothing where there is no number."""
-    known = table.astype(object).where(table.notna(), None)
-    return [(name, known[name].tolist()) for name in table.columns]
+    kept = [table.drop(columns="mean_sensing_ms") for table in computed]
+    # Nothing where there is no number, which would not be equal to itself.
+    known = [table.astype(object).where(table.notna(), None) for table in kept]
+    return [[table[name].tolist() for name in table.columns] for table in known]
 
 
 def worker_processes() -> list[int]:
@@ -88,18 +82,6 @@ class TestTasks:
         task = next(trial_tasks(series(), 100))
         before = task_key(task)
         monkeypatch.setattr(tasks, "code_of", lambda task: f"another {task.kind}")
-        assert task_key(task) != before
-
-    def test_the_key_names_the_sources_of_a_problem(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        place = "studies.light_dark:LightDark"
-        task = next(trial_tasks(series(problem=place), 100))
-        before = task_key(task)
-        found = tasks._digest_behind
-        monkeypatch.setattr(
-            tasks,
-            "_digest_behind",
-            lambda at, whole=False: "another" if at == place else found(at, whole),
-        )
         assert task_key(task) != before
 
     def test_an_edited_source_is_noticed(self, tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """What the studies of ways and parameters make of results that are known beforehand."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator
@@ -39,13 +37,11 @@ def _few_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(selectors, "INTERVALS", few)
     each_and_all = (*((interval, (interval,)) for interval in few), ("mean", few))
     monkeypatch.setattr(selectors, "_EACH_AND_ALL", each_and_all)
-    cases = {name: parameters._CASES[name] for name in ("tight hole", "peg in space", "passer-by")}
-    monkeypatch.setattr(parameters, "_CASES", cases)
-
-
-def selector_of(task: Task) -> dict[str, object]:
-    found: dict[str, object] = task.parameters["planning"]["selector"]
-    return found
+    names = ("tight hole", "peg in space", "passer-by")
+    for module in (selectors, parameters):
+        cases = {name: module._CASES[name] for name in names}
+        monkeypatch.setattr(module, "_CASES", cases)
+    monkeypatch.setattr(selectors, "GROUPS", dict.fromkeys(selectors.GROUPS, names))
 
 
 @pytest.mark.parametrize("study", [selectors.Selectors(), parameters.Parameters()])
@@ -120,7 +116,8 @@ def decided() -> Iterator[Report]:
     def trial(task: Task, number: int) -> tuple[bool, int, float]:
         world = math.exp(0.3 * noise(task, number, ["problem", "model", "seed"]))
         own = math.exp(0.05 * noise(task, number, ["problem", "model", "seed", "planning"]))
-        method, estimator = (selector_of(task)[name] for name in ("method", "estimator"))
+        selector = task.parameters["planning"]["selector"]
+        method, estimator = (selector[name] for name in ("method", "estimator"))
         problem = str(task.parameters["problem"])
         choosing = task.parameters["seed"] == SCALE.seed
         interval = task.parameters["planning"]["sensing_interval"]

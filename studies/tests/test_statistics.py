@@ -115,11 +115,7 @@ def test_ratios_of_differences_of_logarithms() -> None:
     assert statistics.ratio_of(difference) == pytest.approx((0.5, 0.25, 2.0))
     assert statistics.cells_of(
         "ratio", statistics.ratio_of(statistics.Interval(0.0, -math.inf, 1e6))
-    ) == {
-        "ratio": 1.0,
-        "ratio_low": 0.0,
-        "ratio_high": pytest.approx(math.exp(700.0)),
-    }
+    ) == {"ratio": 1.0, "ratio_low": 0.0, "ratio_high": pytest.approx(math.exp(700.0))}
     missing = statistics.cells_of("mean", statistics.Interval(math.nan, -math.inf, math.inf))
     assert list(missing) == ["mean", "mean_low", "mean_high"]
     assert all(map(math.isnan, missing.values()))  # type: ignore[arg-type]

@@ -1,7 +1,5 @@
 """Plans for beliefs in Van der Pol tag, and rules for when to look."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

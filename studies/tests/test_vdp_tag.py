@@ -1,7 +1,5 @@
 """Van der Pol tag: its definition, and the published heuristics as a test of the port."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

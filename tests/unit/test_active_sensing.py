@@ -1,7 +1,5 @@
 """The typed service and its client: decisions as in process, whoever answers and whoever dies."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Commands of other packages, as entry points."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

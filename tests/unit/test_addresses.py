@@ -1,7 +1,5 @@
 """Addresses and the system's refusals as words."""
 
-from __future__ import annotations
-
 import errno
 import os
 

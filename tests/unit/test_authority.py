@@ -1,7 +1,5 @@
 """The authority: whose certificate and key it is, and for how long."""
 
-from __future__ import annotations
-
 import shutil
 from datetime import UTC, datetime, timedelta
 from pathlib import Path

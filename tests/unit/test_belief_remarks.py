@@ -1,7 +1,5 @@
 """What a trial's beliefs tell: of what needs a setting or some noise, and of nothing else."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What a service measures of its machine and of problems; no number of seconds is expected."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Samples against likelihood: how often a right problem is accused, and what a wrong one needs."""
 
-from __future__ import annotations
-
 import numpy as np
 from tests.unit.test_problem_check import Rover
 

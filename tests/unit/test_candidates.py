@@ -1,7 +1,5 @@
 """What a tuning tries of a configuration."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import get_args
 

@@ -1,7 +1,5 @@
 """A disc in a maze."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

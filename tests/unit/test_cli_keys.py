@@ -1,7 +1,5 @@
 """What ``holdfast keys`` refuses before it makes anything; test_key_ring.py has the keys."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """When a run that has ended is started again."""
 
-from __future__ import annotations
-
 import signal
 
 import pytest

@@ -1,7 +1,5 @@
 """``holdfast tune``: its options, its files, and how it goes on."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,11 +1,11 @@
 """One table of options gives the parser, the help, the messages and the repeated command."""
 
-from __future__ import annotations
-
+import shlex
 import sys
 from pathlib import Path
 
 import pytest
+from tests.answers import answers_in
 from tests.command_line import commands, options_of
 
 from holdfast.cli import main
@@ -63,24 +63,11 @@ def test_words_with_a_dash_in_front_are_read_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "BEANS is missing"),
-        (["bag", "--cups", "10"], "--cups is '10'; allowed are whole numbers from 1 to 9"),
-        (["bag", "-c", "-1"], "--cups is '-1'; allowed are whole numbers from 1 to 9"),
-        (["bag", "--heat", "nan"], "--heat is 'nan'; allowed are numbers from 50 to 99.5 (°C)"),
-        (["bag", "--mill", "corse"], "allowed are fine and coarse; did you mean coarse?"),
-        (["bag", "--cups"], "--cups needs a value"),
-        (["bag", "--milk=1"], "--milk takes no value"),
-        (["bag", "-m=1"], "--milk takes no value"),
-        (["bag", "-mx"], "'-x' is no option of holdfast brew"),
-        (["bag", "--cup", "3"], "'--cup' is no option of holdfast brew; did you mean --cups?"),
-        ([""], "BEANS is ''; expected a path (. is the current directory)"),
-    ],
+    ("line", "message"), [*answers_in("option_mistakes.txt"), ("", "BEANS is missing")]
 )
-def test_bad_arguments(arguments: list[str], message: str) -> None:
+def test_bad_arguments(line: str, message: str) -> None:
     with pytest.raises(OptionError) as refused:
-        Brew.parse("brew", arguments)
+        Brew.parse("brew", shlex.split(line))
     assert message in str(refused.value)
 
 

@@ -1,7 +1,5 @@
 """Problems from plain data; ``test_config_loader.py`` has those of files, with their lines."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -22,10 +20,7 @@ def test_a_built_in_problem() -> None:
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        (
-            {"init_mean": [0.5]},
-            r"model\.init_mean is \[0\.5\] \(a list of 1\); expected",
-        ),
+        ({"init_mean": [0.5]}, r"model\.init_mean is \[0\.5\] \(a list of 1\); expected"),
         ({"init_maen": 1}, r"model\.init_maen is not a known key; did you mean init_mean\?"),
         ({"launch": 1}, "launch is a key of recovery, not of model"),
     ],

@@ -1,7 +1,5 @@
 """Files and endpoints that a person names."""
 
-from __future__ import annotations
-
 import os
 import socket
 import sys

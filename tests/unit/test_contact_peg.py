@@ -1,7 +1,5 @@
 """The example examples/mujoco_peg: what its planner believes, and, where MuJoCo is, its robot."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A service's socket for datagrams, shared by links."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 from typing import Any

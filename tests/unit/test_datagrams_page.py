@@ -1,7 +1,5 @@
 """docs/datagrams.md: its test vectors and limits are the code's."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Deadlines, on a clock that the test moves."""
 
-from __future__ import annotations
-
 import threading
 
 from holdfast_ros.deadlines import Deadline

@@ -1,7 +1,5 @@
 """Sensing actions that another one makes superfluous, and the estimator that leaves them out."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

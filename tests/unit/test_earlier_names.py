@@ -1,7 +1,5 @@
 """An earlier name goes when it was said to; that it warns, the tests of the name itself show."""
 
-from __future__ import annotations
-
 from packaging.version import Version
 
 import holdfast

@@ -1,7 +1,5 @@
 """Ending signals as callbacks: the first is handled, the second has its usual effect."""
 
-from __future__ import annotations
-
 import asyncio
 import signal
 import threading
@@ -21,9 +19,7 @@ def loop() -> Iterator[asyncio.AbstractEventLoop]:
     loop.close()
 
 
-def test_the_first_is_a_callback_and_the_second_interrupts(
-    loop: asyncio.AbstractEventLoop,
-) -> None:
+def test_the_first_is_a_callback_and_the_second_interrupts(loop: asyncio.AbstractEventLoop) -> None:
     numbers: list[int] = []
     with pytest.raises(KeyboardInterrupt), ending_signals(loop, numbers.append):
         signal.raise_signal(signal.SIGINT)

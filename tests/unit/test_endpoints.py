@@ -1,14 +1,12 @@
 """Reading endpoints, and what is refused."""
 
-from __future__ import annotations
-
 import socket
-from pathlib import Path
 
 import pytest
+from tests.answers import answers_in
 
 from holdfast.errors import TransportError
-from holdfast.transport.endpoints import Endpoint, TlsFiles, check_credentials, parse_endpoint
+from holdfast.transport.endpoints import Endpoint, parse_endpoint
 
 
 @pytest.mark.parametrize(
@@ -33,46 +31,14 @@ def test_an_endpoint_is_read_and_written(text: str, expected: Endpoint) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        *answers_in("endpoint_mistakes.txt"),
         ("", "does not begin with a protocol.*tcp, tls, udp and unix"),
-        ("127.0.0.1:7447", r"does not begin with a protocol.*as in tcp/127\.0\.0\.1:7447"),
-        ("localhost", "does not begin with a protocol"),
-        ("TCP/localhost:1", "does not begin with a protocol"),
-        ("ws/127.0.0.1:7447", "protocol ws is not allowed; allowed are"),
-        ("tcp://127.0.0.1:7447", r"write tcp/127\.0\.0\.1:7447$"),
-        ("tpc/127.0.0.1:7447", r"did you mean tcp\?"),
-        ("http/localhost:80", r"protocol http is not allowed; allowed are tcp"),
-        ("tcp/localhost", "has no port: write tcp/HOST:PORT"),
-        ("tcp/[::1]", "has no port"),
-        ("tcp/", "has no port"),
-        ("tcp/localhost:", "port '' is not a number from 0 to 65535"),
-        ("tcp/localhost:65536", "port '65536' is not a number"),
         ("tcp/localhost:" + "9" * 5000, "is not a number from 0"),
-        ("tcp/localhost:-1", "port '-1' is not a number"),
-        ("tcp/localhost:7447/x", "port '7447/x' is not a number"),
-        ("tcp/localhost:\uff17\uff14", "is not a number"),
-        ("tcp/::1:7447", r"stands in brackets, as in tcp/\[::1\]:7447"),
-        ("tcp/[127.0.0.1]:7447", "is no IPv6 address"),
-        ("tcp/[nonsense]:7447", "is no IPv6 address"),
-        ("tcp/:7447", "'' is no host name or address"),
-        ("tcp/300.1.1.1:7447", "'300.1.1.1' is no host name or address"),
-        ("tcp/127.0.0:7447", "'127.0.0' is no host name or address"),
-        ("tcp/a b:7447", "'a b' is no host name or address"),
-        ("tcp/-a:7447", "'-a' is no host name or address"),
-        ("tcp/*:7447", r"'\*' is no host name or address"),
-        (f"tcp/{'b' * 64}.example:7447", "'b{64}': .* has at most 63 characters between its dots"),
-        (f"tcp/planner.{'b' * 64}:7447", "'b{64}': .* has at most 63 characters between its dots"),
-        (f"tcp/{'b.' * 127}b:7447", "is no host name or address"),
-        ("tcp/[fe80::1%eth\u00e9]:7447", "'eth\u00e9' is no name of a network interface"),
-        (f"tcp/[fe80::1%{'a' * 16}]:7447", "'a{16}' is no name of .* at most 15"),
-        ("tcp/localhost:7447#iface=eth0", "port .7447#iface=eth0. is not a number"),
-        ("unix/", "has no path"),
-        ("unix//", "has no path"),
-        ("unix//" + "x" * 107, "a path of 108 bytes; .* at most 107"),
     ],
 )
 def test_what_is_no_endpoint_is_refused_with_the_reason(text: str, message: str) -> None:
     with pytest.raises(TransportError, match=message):
-        parse_endpoint(text)
+        parse_endpoint(text.rstrip("\n"))
 
 
 @pytest.mark.parametrize(
@@ -101,18 +67,3 @@ def test_localhost_that_leads_elsewhere_is_not_loopback(monkeypatch: pytest.Monk
     elsewhere = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("10.0.0.7", 0))]
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_: elsewhere)
     assert not parse_endpoint("tcp/localhost:1").is_loopback
-
-
-def test_credentials_go_with_the_protocols_that_use_them(tmp_path: Path) -> None:
-    files = TlsFiles.of(tmp_path)
-    for file in (files.authority, files.certificate, files.key):
-        file.touch()
-    tcp, tls, unix = map(parse_endpoint, ("tcp/localhost:1", "tls/localhost:1", "unix//run/s"))
-    check_credentials(tcp, None)
-    check_credentials(tls, files)
-    check_credentials(unix, None)
-    check_credentials(unix, files)  # a robot has both: its services afar and the local one
-    with pytest.raises(TransportError, match="tls needs credentials"):
-        check_credentials(tls, None)
-    with pytest.raises(TransportError, match="tcp does not use the credentials"):
-        check_credentials(tcp, files)

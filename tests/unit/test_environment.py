@@ -1,9 +1,5 @@
 """The simulated world: a function of its seed, its trial and what is done in it."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -16,8 +12,6 @@ from holdfast.planning.outcome import MoveResult
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.problems.problem import Problem
 from holdfast.robot.environment import Environment, SimulatedEnvironment
-
-EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture(scope="module", params=registry.names())

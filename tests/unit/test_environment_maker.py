@@ -1,8 +1,5 @@
 """The environment that a configuration names is found, and given what it asks for."""
 
-from __future__ import annotations
-
-import json
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.answers import answers_in
 
 from holdfast.config.loader import load
 from holdfast.errors import ConfigurationError, EnvironmentFailedError
@@ -17,6 +15,8 @@ from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.environment_maker import EnvironmentMaker, load_environment
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+
+Loaded = Callable[[str], EnvironmentMaker]
 
 ROBOTS = """\
 class Robot:
@@ -61,19 +61,16 @@ number = 3
 
 class TestLoadEnvironment:
     @pytest.fixture
-    def loaded(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> Iterator[Callable[..., EnvironmentMaker]]:
+    def loaded(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Loaded]:
         """Load what is named, beside a configuration file."""
         monkeypatch.setattr(sys, "path", [*sys.path])
         (tmp_path / "robots.py").write_text(ROBOTS)
         (tmp_path / "broken_robots.py").write_text("1 + 'one'\n")
         (tmp_path / "lonely_robots.py").write_text("import absent_library\n")
 
-        def load_one(name: str, **settings: object) -> EnvironmentMaker:
-            section = json.dumps({"object": name, **settings})
+        def load_one(settings: str) -> EnvironmentMaker:
             (tmp_path / "run.yaml").write_text(
-                f"problem: peg_in_hole_2d\nsimulator: {{seed: 5}}\nenvironment: {section}\n"
+                f"problem: peg_in_hole_2d\nsimulator: {{seed: 5}}\nenvironment: {{{settings}}}\n"
             )
             return load_environment(load(tmp_path / "run.yaml"))
 
@@ -94,10 +91,8 @@ class TestLoadEnvironment:
         assert isinstance(again, SimulatedEnvironment)
         assert again.state.tobytes() == expected.state.tobytes()
 
-    def test_one_of_ones_own_is_made_anew_for_each_trial(
-        self, loaded: Callable[..., EnvironmentMaker]
-    ) -> None:
-        maker = loaded("robots:Robot", arguments={"port": 3, "places": [1]}, timeout_ms=20)
+    def test_one_of_ones_own_is_made_anew_for_each_trial(self, loaded: Loaded) -> None:
+        maker = loaded("object: robots:Robot, arguments: {port: 3, places: [1]}, timeout_ms: 20")
         assert not maker.simulated
         assert (maker.name, maker.timeout_ms) == ("robots:Robot", 20.0)
         first: Any = maker(0)
@@ -109,21 +104,15 @@ class TestLoadEnvironment:
         assert second.places == [1]
         assert first.problem is second.problem is maker.problem
 
-    def test_a_constructor_gets_only_what_it_names(
-        self, loaded: Callable[..., EnvironmentMaker]
-    ) -> None:
-        assert isinstance(loaded("robots:Plain")(0), Environment)
-        environment: Any = loaded("robots:AnyArguments", arguments={"port": 3})(0)
+    def test_a_constructor_gets_only_what_it_names(self, loaded: Loaded) -> None:
+        assert isinstance(loaded("object: robots:Plain")(0), Environment)
+        environment: Any = loaded("object: robots:AnyArguments, arguments: {port: 3}")(0)
         assert environment.options == {"port": 3}
 
-    def test_methods_may_be_made_by_the_constructor(
-        self, loaded: Callable[..., EnvironmentMaker]
-    ) -> None:
-        assert isinstance(loaded("robots:Late")(0), Environment)
+    def test_methods_may_be_made_by_the_constructor(self, loaded: Loaded) -> None:
+        assert isinstance(loaded("object: robots:Late")(0), Environment)
 
-    def test_a_package_may_register_one(
-        self, tmp_path: Path, loaded: Callable[..., EnvironmentMaker]
-    ) -> None:
+    def test_a_package_may_register_one(self, tmp_path: Path, loaded: Loaded) -> None:
         package = tmp_path / "turtle_robots-1.0.dist-info"
         package.mkdir()
         (package / "METADATA").write_text("Metadata-Version: 2.1\nName: turtle-robots\n")
@@ -131,49 +120,18 @@ class TestLoadEnvironment:
             "[holdfast.environments]\nturtle = robots:Plain\n"
         )
         sys.path.insert(0, str(tmp_path))
-        assert type(loaded("turtle")(0)).__name__ == "Plain"
+        assert type(loaded("object: turtle")(0)).__name__ == "Plain"
 
-    def test_it_lacks_a_method(self, loaded: Callable[..., EnvironmentMaker]) -> None:
-        maker = loaded("robots:Half")
+    def test_it_lacks_a_method(self, loaded: Loaded) -> None:
+        maker = loaded("object: robots:Half")
         with pytest.raises(
             EnvironmentFailedError,
             match=r"robots:Half is no environment: it lacks perform_sensing and is_done; it needs",
         ):
             maker(0)
 
-    @pytest.mark.parametrize(
-        ("name", "arguments", "expected"),
-        [
-            ("robots:Robt", {}, r"environment.object: robots:Robt: .* did you mean Robot"),
-            ("robots:number", {}, "is not a class but int"),
-            ("turtle", {}, r"environment.object: turtle is not a registered name \(registered: "),
-            ("robots", {}, "robots is not a registered name; did you mean robots:"),
-            ("robots.Plain", {}, r"did you mean robots:Plain\? "),
-            ("robots.py", {}, "did you mean robots:"),
-            ("lonely_robots:Robot", {}, "cannot be imported .*No module named 'absent_library'"),
-            (
-                "broken_robots:Robot",
-                {},
-                r"environment.object: broken_robots:Robot raised TypeError: (.|\n)*1 \+ 'one'",
-            ),
-            (
-                "robots:Robot",
-                {"prt": 3},
-                "environment.arguments.prt is no argument of robots:Robot; did you mean port.\n"
-                "allowed: port, places$",
-            ),
-            ("robots:Robot", {"trial": 3}, "environment.arguments.trial cannot be set: holdfast"),
-            ("robots:Plain", {"port": 3}, "arguments.port is no argument of robots:Plain\nallowed"),
-            ("robots:Needy", {}, "environment.arguments do not suit robots:Needy.*'port'"),
-        ],
-    )
-    def test_what_is_refused(
-        self,
-        name: str,
-        arguments: dict[str, object],
-        expected: str,
-        loaded: Callable[..., EnvironmentMaker],
-    ) -> None:
+    @pytest.mark.parametrize(("text", "expected"), answers_in("environment_mistakes.txt"))
+    def test_what_is_refused(self, text: str, expected: str, loaded: Loaded) -> None:
         with pytest.raises(ConfigurationError, match=expected) as caught:
-            loaded(name, arguments=arguments)
+            loaded(text)
         assert "run.yaml: environment." in str(caught.value)

@@ -127,6 +127,28 @@ class Bench:
     def event(self) -> EnvironmentEvent:
         return self.loop.run_until_complete(asyncio.wait_for(self.queue.get(), PATIENCE_S))
 
+    def acted(self) -> Acted:
+        event = self.event()
+        assert isinstance(event, Acted)
+        return event
+
+    def call(
+        self, robot: Robot, method: str, answer: Any, step: int = 0, **settings: Any
+    ) -> OnLoop:
+        """Have a method called that answers so; those before it answer as ever."""
+        if method == "steps_performed":
+            robot.answers[method] = answer
+            runner = self.open(robot, resumed=True, **settings)
+            runner.begin(step)
+            return runner
+        runner = self.begin(robot, **settings)
+        robot.answers[method] = answer
+        if method == "perform_sensing":
+            runner.sense(step, 0)
+        else:
+            runner.perform(step, ACTION)
+        return runner
+
     def failure(self) -> EnvironmentFailed:
         event = self.event()
         assert isinstance(event, EnvironmentFailed)
@@ -207,18 +229,11 @@ class TestEvents:
         assert bench.event() == Acted(Moved(0, -1.0))
         robot.answers.update(perform=None, is_done=np.True_)
         runner.perform(1, ACTION)
-        acted = bench.event()
+        acted = bench.acted()
         assert acted == Acted(Moved(1, None), Ending("succeeded"))
-        assert isinstance(acted, Acted)
         assert type(acted.ending) is Ending
-        assert [method for method, _ in robot.calls] == [
-            "is_done",
-            "perform_sensing",
-            "perform",
-            "is_done",
-            "perform",
-            "is_done",
-        ]
+        methods = [method for method, _ in robot.calls]
+        assert methods == ["is_done", "perform_sensing", *("perform", "is_done") * 2]
         assert robot.calls[1][1] == 2
         assert robot.calls[2][1].tolist() == ACTION.tolist()
 
@@ -229,9 +244,8 @@ class TestEvents:
         runner.begin()
         assert bench.event() == EnvironmentReady(Ending("failed"), None)
         runner.perform(0, ACTION)
-        acted = bench.event()
+        acted = bench.acted()
         assert acted == Acted(Moved(0, -1.0), Ending("failed"))
-        assert isinstance(acted, Acted)
         assert type(acted.ending) is Ending
 
     def test_the_count_is_asked_for_after_a_crash_alone(self, bench: Bench) -> None:
@@ -297,19 +311,7 @@ class TestFailures:
     def test_a_method_that_raises(
         self, method: str, unknown: bool, performed: bool, bench: Bench
     ) -> None:
-        robot = Robot()
-        runner = bench.open(robot, resumed=True)
-        if method == "steps_performed":
-            robot.answers[method] = fail
-            runner.begin(5)
-        else:
-            runner.begin(5)
-            assert bench.event() == EnvironmentReady(None, 4)
-            robot.answers[method] = fail
-            if method == "perform_sensing":
-                runner.sense(5, 0)
-            else:
-                runner.perform(5, ACTION)
+        bench.call(Robot(), method, fail, step=5)
         failed = bench.failure()
         assert (failed.step, failed.what, failed.action_in_doubt) == (5, method, unknown)
         assert failed.performed == (Acted(Moved(5, -1.0)) if performed else None)
@@ -359,17 +361,7 @@ class TestFailures:
     def test_a_value_that_nobody_can_use(
         self, method: str, answer: object, expected: str, bench: Bench
     ) -> None:
-        robot = Robot()
-        if method == "steps_performed":
-            robot.answers[method] = answer
-            bench.open(robot, resumed=True).begin()
-        else:
-            runner = bench.begin(robot)
-            robot.answers[method] = answer
-            if method == "perform_sensing":
-                runner.sense(0, 1)
-            else:
-                runner.perform(0, ACTION)
+        bench.call(Robot(), method, answer)
         failed = bench.failure()
         assert failed.what == method
         assert failed.text.startswith(f"robot: {method} returned ")
@@ -495,8 +487,7 @@ class TestStalls:
     """The environment waits for the test, and so the timeout always comes first."""
 
     @pytest.mark.parametrize(
-        ("method", "unknown"),
-        [("perform_sensing", False), ("perform", True), ("is_done", False)],
+        ("method", "unknown"), [("perform_sensing", False), ("perform", True), ("is_done", False)]
     )
     def test_a_method_that_does_not_return(
         self, method: str, unknown: bool, threaded: Bench
@@ -504,12 +495,9 @@ class TestStalls:
         released = threading.Event()
         robot = Robot()
         # Long enough for the calls before that one, however busy the machine is.
-        runner = threaded.begin(robot, timeout_ms=1000.0)
-        robot.answers[method] = lambda: released.wait(PATIENCE_S) and None
-        if method == "perform_sensing":
-            runner.sense(7, 0)
-        else:
-            runner.perform(7, ACTION)
+        runner = threaded.call(
+            robot, method, lambda: released.wait(PATIENCE_S) and None, 7, timeout_ms=1000.0
+        )
         assert threaded.event() == EnvironmentFailed(
             7,
             method,
@@ -618,8 +606,7 @@ class TestShown:
         shown = MoveResult(-2.0, [0.1, 0.2], np.array([3], dtype=np.int32))
         runner = bench.begin(Robot(perform=shown))
         runner.perform(0, ACTION)
-        acted = bench.event()
-        assert isinstance(acted, Acted)
+        acted = bench.acted()
         assert acted.moved == Moved(0, -2.0, encode_floats([0.1, 0.2]), encode_floats([3.0]))
         assert acted.ending is None
 
@@ -630,8 +617,7 @@ class TestShown:
         assert isinstance(robot, Robot)
         robot.answers["is_done"] = ending
         runner.perform(0, ACTION)
-        acted = bench.event()
-        assert isinstance(acted, Acted)
+        acted = bench.acted()
         assert acted.ending is not None
         assert acted.ending.outcome == "failed"
         assert acted.ending.reason.startswith("hit the \\x1b[2Jwall !!!")
@@ -642,8 +628,7 @@ class TestShown:
         runner.sense(0, 1)
         assert bench.event() == Sensed(0, 1, b"")
         runner.perform(0, ACTION)
-        acted = bench.event()
-        assert isinstance(acted, Acted)
+        acted = bench.acted()
         assert acted.late == (Late(1, 0, encode_floats([1.5])),)
 
     @pytest.mark.parametrize("nothing", [None, [np.nan], np.full(3, np.nan), float("nan")])
@@ -655,8 +640,7 @@ class TestShown:
         runner.sense(0, 1)
         assert bench.event() == NoReading(0)
         runner.perform(0, ACTION)
-        acted = bench.event()
-        assert isinstance(acted, Acted)
+        acted = bench.acted()
         assert (acted.no_reading, [late.taken for late in acted.late]) == ((0,), [1])
         robot.answers["perform_sensing"] = [np.nan, 1.0]
         runner.sense(1, 1)

@@ -1,6 +1,6 @@
 """Entropies of weighted points: what does not depend on what, degenerate points, bad input."""
 
-from __future__ import annotations
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,22 +66,6 @@ class TestResolutionOfEachCoordinate:
     def test_a_single_point_is_known_to_within_an_ellipsoid(self) -> None:
         expected = np.log(4.0 / 3.0 * np.pi * self.SIZES.prod())
         assert abs(entropy(np.ones((1, 3)), None, NearestNeighbor(1, self.SIZES)) - expected) < 1e-9
-
-    def test_another_number_of_sizes(self) -> None:
-        with pytest.raises(InvalidValueError, match=r"resolution of shape \(2,\): need .* \(3,\)"):
-            entropy(draw(20)[0], None, NearestNeighbor(5, np.ones(2)))
-
-    @pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf, 1e-151])
-    def test_a_size_out_of_bounds(self, bad: float) -> None:
-        with pytest.raises(InvalidValueError, match=r"resolution \[.*\]: allowed are .* in every"):
-            entropy(draw(20)[0], None, NearestNeighbor(5, np.array([0.1, bad, 0.1])))
-
-    def test_a_point_that_is_too_many_resolutions_away(self) -> None:
-        points = draw(20)[0] + 1e9
-        with pytest.raises(
-            InvalidValueError, match=r"point 0 is .* resolutions from zero: at most"
-        ):
-            entropy(points, None, NearestNeighbor(5, np.full(3, 1e-145)))
 
 
 class TestDegeneratePoints:
@@ -153,68 +137,56 @@ class TestDefaults:
         assert np.asarray(estimation.entropy(points, weights.reshape(1, -1))).shape == (1,)
 
 
-class TestBadInput:
-    @pytest.mark.parametrize("shape", [(0, 3), (5,), (2, 3, 1), ()])
-    def test_shape_of_points(self, shape: tuple[int, ...]) -> None:
-        with pytest.raises(InvalidValueError, match=r"points of shape \(.*\): need \(n, d\)"):
-            estimation.entropy(np.zeros(shape))
+def weights_with(bad: float) -> FloatArray:
+    weights = draw(20)[1]
+    weights[3] = bad
+    return weights
 
-    @pytest.mark.parametrize("dimension", [0, 65])
-    def test_dimension(self, dimension: int) -> None:
-        with pytest.raises(
-            InvalidValueError, match=f"points of {dimension} coordinates: allowed are 1 to 64"
-        ):
-            estimation.entropy(np.zeros((9, dimension)))
 
-    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-    def test_points_not_finite(self, bad: float) -> None:
-        points, _ = draw(20)
-        points[7] = [1.0, bad, 2.0]
-        for estimator in ESTIMATORS.values():
-            with pytest.raises(InvalidValueError, match=rf"point 7 is \[ *1\. +{bad} +2\. *\]"):
-                entropy(points, None, estimator)
+NO_NUMBERS = (np.nan, np.inf, -np.inf)
+MISFITS: list[tuple[str, Any, Any, Any]] = [
+    *((r"points of shape \(.*\): need \(n, d\)", np.zeros(shape), None, None)
+      for shape in ((0, 3), (5,), (2, 3, 1), ())),
+    *((f"points of {size} coordinates: allowed are 1 to 64", np.zeros((9, size)), None, None)
+      for size in (0, 65)),
+    *((f"weight of point 3 is {bad}: must be >= 0", None, rows, None)
+      for bad in (*NO_NUMBERS, -0.5)
+      for rows in (weights_with(bad), np.stack([np.ones(20), weights_with(bad)]))),
+    (r"weights\[1\] are all zero: one must be pos", None, np.eye(2, 20) * [[1.0], [0.0]], None),
+    *((r"weights of shape .* need \(20,\) or \(b, 20", None, np.ones(shape), None)
+      for shape in ((19,), (21,), (2, 19), (2, 2, 20), (0,))),
+    *((f"neighbors {count}: allowed are whole n", None, None, NearestNeighbor(count, 0.1))
+      for count in (0, -1)),
+    *((f"neighbors {count}: must be below .* 20", None, None, NearestNeighbor(count, 0.1))
+      for count in (20, 21, 10**6)),
+    *((f"resolution {size}: allowed are", None, None, NearestNeighbor(5, size))
+      for size in (0.0, -1.0, np.nan, np.inf)),
+    *((r"resolution \[.*\]: allowed are .* in every", None, None,
+       NearestNeighbor(5, np.array([0.1, size, 0.1])))
+      for size in (0.0, -1.0, np.nan, np.inf, 1e-151)),
+    (r"resolution of shape \(2,\): need .* \(3,\)", None, None, NearestNeighbor(5, np.ones(2))),
+    (r"point 0 is .* resolutions from zero: at most", draw(20)[0] + 1e9, None,
+     NearestNeighbor(5, np.full(3, 1e-145))),
+    *((r"variance \[.*\]: every entry must be > 0", None, None,
+       GaussianMixture(np.array([0.1, bad, 0.1])))
+      for bad in (0.0, -0.1, np.nan, np.inf)),
+    *((rf"variance of shape \({size},\): need \(3,\)", None, None, GaussianMixture(np.ones(size)))
+      for size in (1, 2, 4)),
+]  # fmt: skip
 
-    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -0.5])
-    def test_weights_out_of_bounds(self, bad: float) -> None:
-        points, weights = draw(20)
-        weights[3] = bad
-        for rows in (weights, np.stack([np.ones(20), weights])):
-            with pytest.raises(
-                InvalidValueError, match=f"weight of point 3 is {bad}: must be >= 0"
-            ):
-                estimation.entropy(points, rows)
 
-    def test_weights_all_zero(self) -> None:
-        points, weights = draw(20)
-        with pytest.raises(InvalidValueError, match=r"weights\[1\] are all zero: one must be pos"):
-            estimation.entropy(points, np.stack([weights, np.zeros(20)]))
+@pytest.mark.parametrize(("message", "points", "weights", "estimator"), MISFITS)
+def test_what_does_not_fit_is_named(
+    message: str, points: Any, weights: Any, estimator: Any
+) -> None:
+    with pytest.raises(InvalidValueError, match=message):
+        estimation.entropy(draw(20)[0] if points is None else points, weights, estimator)
 
-    @pytest.mark.parametrize("shape", [(19,), (21,), (2, 19), (2, 2, 20), (0,)])
-    def test_shape_of_weights(self, shape: tuple[int, ...]) -> None:
-        with pytest.raises(InvalidValueError, match=r"weights of shape .* need \(20,\) or \(b, 20"):
-            estimation.entropy(draw(20)[0], np.ones(shape))
 
-    @pytest.mark.parametrize("neighbors", [0, -1])
-    def test_no_neighbours(self, neighbors: int) -> None:
-        with pytest.raises(InvalidValueError, match=f"neighbors {neighbors}: allowed are whole n"):
-            entropy(draw(20)[0], None, NearestNeighbor(neighbors, 0.1))
-
-    @pytest.mark.parametrize("neighbors", [20, 21, 10**6])
-    def test_as_many_neighbours_as_points(self, neighbors: int) -> None:
-        with pytest.raises(InvalidValueError, match=f"neighbors {neighbors}: must be below .* 20"):
-            entropy(draw(20)[0], None, NearestNeighbor(neighbors, 0.1))
-
-    @pytest.mark.parametrize("resolution", [0.0, -1.0, np.nan, np.inf])
-    def test_resolution(self, resolution: float) -> None:
-        with pytest.raises(InvalidValueError, match=f"resolution {resolution}: allowed are"):
-            entropy(draw(20)[0], None, NearestNeighbor(5, resolution))
-
-    @pytest.mark.parametrize("bad", [0.0, -0.1, np.nan, np.inf])
-    def test_variance(self, bad: float) -> None:
-        with pytest.raises(InvalidValueError, match=r"variance \[.*\]: every entry must be > 0"):
-            entropy(draw(20)[0], None, GaussianMixture(np.array([0.1, bad, 0.1])))
-
-    @pytest.mark.parametrize("size", [1, 2, 4])
-    def test_size_of_the_variance(self, size: int) -> None:
-        with pytest.raises(InvalidValueError, match=rf"variance of shape \({size},\): need \(3,\)"):
-            entropy(draw(20)[0], None, GaussianMixture(np.ones(size)))
+@pytest.mark.parametrize("bad", NO_NUMBERS)
+def test_points_that_are_not_finite(bad: float) -> None:
+    points, _ = draw(20)
+    points[7] = [1.0, bad, 2.0]
+    for estimator in ESTIMATORS.values():
+        with pytest.raises(InvalidValueError, match=rf"point 7 is \[ *1\. +{bad} +2\. *\]"):
+            entropy(points, None, estimator)

@@ -4,7 +4,7 @@ import heapq
 import itertools
 import math
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -27,6 +27,8 @@ from holdfast.transport.exchanges import (
     ServiceExchange,
 )
 from holdfast.transport.redundancy import Paths
+
+NOWHERE = Paths(lambda _: None, lambda _number, _message: None, lambda: 0)
 
 
 class Sent(NamedTuple):
@@ -134,9 +136,7 @@ class Network:
         end = self.now + limit_s
         while not until():
             due = min(
-                self._queue[0][0] if self._queue else math.inf,
-                self.robot.due,
-                self.service.due,
+                self._queue[0][0] if self._queue else math.inf, self.robot.due, self.service.due
             )
             assert due <= end, f"nothing in {limit_s} s of its time"
             self.now = max(self.now, due)
@@ -167,9 +167,19 @@ class Network:
         self.run(lambda: call in self.done_at)
         return self.done_at[call] - began
 
-    def expected(self, call: int) -> list[ReceivedReply]:
+    def ask_all(self, calls: Sequence[int], pause_s: float = 0.0) -> list[float]:
+        """Ask one after the other, and return how long each answer took; it is the right one."""
+        times = []
+        for call in calls:
+            times.append(self.ask(call))
+            self.check(call)
+            if pause_s:
+                self.wait(pause_s)
+        return times
+
+    def check(self, call: int) -> None:
         replies = [ReceivedReply(call, self.answer + b"%d" % k, False) for k in range(self.parts)]
-        return [*replies, ReceivedReply(call, None, True)]
+        assert self.parts_of[call] == [*replies, ReceivedReply(call, None, True)]
 
     def datagrams_of(self, who: str) -> list[Sent]:
         return [sent for sent in self.sent[who] if sent.datagram]
@@ -179,17 +189,13 @@ class TestWithoutLoss:
     def test_an_answer_takes_one_round_trip(self) -> None:
         network = Network(delay_s=0.04)
         network.begin()
-        for call in range(100):
-            assert network.ask(call) == pytest.approx(0.08)
-            assert network.parts_of[call] == network.expected(call)
+        assert network.ask_all(range(100)) == pytest.approx([0.08] * 100)
 
     def test_nothing_is_sent_twice(self) -> None:
         network = Network(delay_s=0.04)
         network.begin()
         before = {who: len(sent) for who, sent in network.sent.items()}
-        for call in range(300):
-            network.ask(call)
-            network.wait(0.02)
+        network.ask_all(range(300), pause_s=0.02)
         assert len(network.sent["robot"]) - before["robot"] == 300
         assert len(network.sent["service"]) - before["service"] == 3 * 300
         assert all(sent.datagram for who in network.sent for sent in network.sent[who])
@@ -198,8 +204,7 @@ class TestWithoutLoss:
     def test_an_answer_that_takes_its_time_is_asked_for_ever_more_rarely(self) -> None:
         network = Network(delay_s=0.04, work_s=5.0, parts=1)
         network.begin()
-        assert network.ask(1) == pytest.approx(5.08)
-        assert network.parts_of[1] == network.expected(1)
+        assert network.ask_all([1]) == pytest.approx([5.08])
         assert len(network.asked) == 1
         times = [sent.at for sent in network.sent["robot"] if sent.kind == 1]
         pauses = [b - a for a, b in itertools.pairwise(times)]
@@ -211,7 +216,7 @@ class TestWithoutLoss:
         network.begin()
         before = len(network.sent["robot"])
         network.ask(1)
-        assert network.parts_of[1] == network.expected(1)
+        network.check(1)
         # Once in the beginning: that the first sign takes longer than the way is not known.
         assert len(network.sent["robot"]) - before <= 2
 
@@ -233,8 +238,7 @@ class TestTheBeginning:
         network = Network(delay_s=0.04)
         network.robot.begin(0.0)
         network.run(network.is_open)
-        for call in range(50):
-            network.ask(call)
+        network.ask_all(range(50))
         sent = [each for each in network.sent["robot"] if each.kind == 1]
         assert 50 < len(sent) < 60
         assert [each.at for each in sent[-40:]] == sorted({each.at for each in sent[-40:]})
@@ -245,9 +249,7 @@ class TestTheBeginning:
             network = Network(delay_s=0.0435, loss=0.05, seed=seed)
             network.robot.begin(0.0)
             network.run(network.is_open)
-            for call in range(15):
-                times.append(network.ask(call))
-                network.wait(0.05)
+            times += network.ask_all(range(15), pause_s=0.05)
         times.sort()
         assert times[int(0.95 * len(times))] <= 0.105
 
@@ -257,15 +259,12 @@ class TestLoss:
     def test_five_per_cent_each_way(self, seed: int) -> None:
         network = Network(delay_s=0.0435, loss=0.05, seed=seed)
         network.begin()
-        times = sorted(network.ask(call) for call in range(1000))
-        for call in range(1000):
-            assert network.parts_of[call] == network.expected(call)
+        times = sorted(network.ask_all(range(1000)))
         assert times[500] == pytest.approx(0.087)
         assert times[949] <= 0.105
         plain = Network(delay_s=0.0435)
         plain.begin()
-        for call in range(1000):
-            plain.ask(call)
+        plain.ask_all(range(1000))
         for who in network.sent:
             sizes = [sum(s.size + 28 for s in n.datagrams_of(who)) for n in (network, plain)]
             assert sizes[0] <= 3 * sizes[1]
@@ -277,8 +276,7 @@ class TestLoss:
         chance = random.Random(1)
         network.drop = lambda who, _kind: who == "service" and chance.random() < 0.1
         network.begin()
-        for call in range(500):
-            network.ask(call)
+        network.ask_all(range(500))
         assert len(network.sent["service"]) > 1.8 * 3 * 500
         asked_again = len(network.sent["robot"]) - 501
         assert asked_again < 100
@@ -286,14 +284,11 @@ class TestLoss:
     def test_nothing_is_doubled_any_more_when_the_way_is_good_again(self) -> None:
         network = Network(delay_s=0.04, loss=0.1, seed=3)
         network.begin()
-        for call in range(200):
-            network.ask(call)
+        network.ask_all(range(200))
         network.loss = 0.0
-        for call in range(200, 400):
-            network.ask(call)
+        network.ask_all(range(200, 400))
         before = len(network.sent["robot"])
-        for call in range(400, 500):
-            network.ask(call)
+        network.ask_all(range(400, 500))
         assert len(network.sent["robot"]) - before == 100
 
     @pytest.mark.parametrize("lost_kind", [1, 2])
@@ -313,37 +308,22 @@ class TestLoss:
         # One more round trip, and the patience beyond the first.
         assert network.ask(2) <= 0.08 + 0.08 + 0.03 + 4 * 0.04
         assert lost
-        assert network.parts_of[2] == network.expected(2)
+        network.check(2)
 
     @given(
-        loss=st.floats(0.0, 0.5),
-        twice=st.floats(0.0, 0.5),
-        jitter_s=st.floats(0.0, 0.2),
-        delay_s=st.sampled_from([0.0001, 0.01, 0.1]),
-        work_s=st.sampled_from([0.0, 0.001, 0.2]),
-        parts=st.integers(0, 4),
-        seed=st.integers(0, 1000),
+        st.builds(
+            Network,
+            loss=st.floats(0.0, 0.5),
+            twice=st.floats(0.0, 0.5),
+            jitter_s=st.floats(0.0, 0.2),
+            delay_s=st.sampled_from([0.0001, 0.01, 0.1]),
+            work_s=st.sampled_from([0.0, 0.001, 0.2]),
+            parts=st.integers(0, 4),
+            seed=st.integers(0, 1000),
+        )
     )
     @settings(max_examples=60)
-    def test_each_part_comes_once_in_order_whatever_is_lost(
-        self,
-        loss: float,
-        twice: float,
-        jitter_s: float,
-        delay_s: float,
-        work_s: float,
-        parts: int,
-        seed: int,
-    ) -> None:
-        network = Network(
-            delay_s=delay_s,
-            loss=loss,
-            twice=twice,
-            jitter_s=jitter_s,
-            work_s=work_s,
-            parts=parts,
-            seed=seed,
-        )
+    def test_each_part_comes_once_in_order_whatever_is_lost(self, network: Network) -> None:
         network.robot.begin(0.0)
         calls = range(30)
         for call in calls:
@@ -352,7 +332,7 @@ class TestLoss:
             network.wait(0.01)
         network.run(lambda: len(network.done_at) == len(calls), 600.0)
         for call in calls:
-            assert network.parts_of[call] == network.expected(call)
+            network.check(call)
         assert sorted(payload[0] for payload in network.asked) == list(calls)
         assert not network.robot._requests
 
@@ -364,8 +344,7 @@ class TestManyAreLost:
     def flooded(seed: int, loss: float = 0.5, delay_s: float = 0.0005) -> Network:
         network = Network(delay_s=delay_s, seed=seed)
         network.begin()
-        for call in range(-100, 0):
-            network.ask(call)
+        network.ask_all(range(-100, 0))
         chance = random.Random(seed)
         network.drop = lambda who, _kind: who == "robot" and chance.random() < loss
         return network
@@ -374,25 +353,18 @@ class TestManyAreLost:
     @pytest.mark.parametrize("seed", range(3))
     def test_a_question_is_lost_no_more_than_twice(self, seed: int, loss: float) -> None:
         network = self.flooded(seed, loss)
-        times = []
-        for call in range(150):
-            times.append(network.ask(call))
-            network.wait(0.02)
+        times = network.ask_all(range(150), pause_s=0.02)
         # After 10 ms, the least margin, and twice as many it goes on the stream as well.
         assert max(times) <= 0.04
         # Once it is known that many are lost, it does so at once.
         assert sum(each > 0.0011 for each in times[100:]) <= (10 if loss < 0.5 else 1)
-        for call in range(150):
-            assert network.parts_of[call] == network.expected(call)
         assert len(network.asked) == 250
 
     def test_the_stream_takes_the_place_of_the_copy(self) -> None:
         network = self.flooded(5)
-        for call in range(150):
-            network.ask(call)
+        network.ask_all(range(150))
         before = {who: len(sent) for who, sent in network.sent.items()}
-        for call in range(150, 250):
-            network.ask(call)
+        network.ask_all(range(150, 250))
         for who, of_each in (("robot", 1), ("service", 3)):
             sent = [each for each in network.sent[who][before[who] :] if each.kind in (1, 2, 6)]
             assert len(sent) == 2 * of_each * 100
@@ -400,26 +372,21 @@ class TestManyAreLost:
 
     def test_what_is_hedged_is_answered_by_datagrams_where_the_stream_is_held_up(self) -> None:
         network = self.flooded(6)
-        for call in range(150):
-            network.ask(call)
+        network.ask_all(range(150))
         # What the service sends there does not come; what the robot sends comes first.
         paths = network.service._sender.paths
         network.service._sender.paths = paths._replace(stream=lambda _number, _message: None)
-        for call in range(150, 200):
-            network.ask(call)
-            assert network.parts_of[call] == network.expected(call)
+        network.ask_all(range(150, 200))
 
     def test_nothing_goes_there_any_more_when_the_flood_is_over(self) -> None:
         network = self.flooded(7)
-        for call in range(150):
-            network.ask(call)
+        network.ask_all(range(150))
         network.drop = lambda _who, _kind: False
         for call in range(150, 300):
             network.ask(call)
         network.wait(2.0 * KEEP_ALIVE_S)  # a probe comes back
         before = len(network.sent["robot"])
-        for call in range(300, 400):
-            network.ask(call)
+        network.ask_all(range(300, 400))
         asked = network.sent["robot"][before:]
         assert len(asked) == 100
         assert all(each.datagram for each in asked)
@@ -429,13 +396,10 @@ class TestBudget:
     def test_a_way_that_loses_nearly_all_is_given_no_more_than_three_times_the_load(self) -> None:
         network = Network(delay_s=0.04)
         network.begin()
-        network.stream = True
-        for call in range(50):
-            network.ask(call)
+        network.ask_all(range(50))
         network.loss = 0.6
         before = len(network.sent["robot"]), len(network.sent["service"])
-        for call in range(50, 550):
-            network.ask(call)
+        network.ask_all(range(50, 550))
         for who, start in zip(("robot", "service"), before, strict=True):
             sent = [each for each in network.sent[who][start:] if each.datagram]
             first = 500 * (75 + 10 + 2 + OVERHEAD + 28) if who == "robot" else 0
@@ -448,16 +412,13 @@ class TestBudget:
 class TestTheStream:
     def test_before_datagrams_are_known_to_get_through(self) -> None:
         network = Network()
-        assert network.ask(1) == pytest.approx(0.08)
-        assert network.parts_of[1] == network.expected(1)
+        assert network.ask_all([1]) == pytest.approx([0.08])
         assert not any(sent.datagram for who in network.sent for sent in network.sent[who])
 
     def test_where_no_datagram_gets_through(self) -> None:
         network = Network(datagrams=False)
         network.begin()
-        for call in range(10):
-            assert network.ask(call) == pytest.approx(0.08)
-            assert network.parts_of[call] == network.expected(call)
+        assert network.ask_all(range(10)) == pytest.approx([0.08] * 10)
         assert not network.is_open()
         before = len(network.datagrams_of("robot"))
         network.wait(60.0)
@@ -475,11 +436,11 @@ class TestTheStream:
         assert [sent.datagram for sent in network.sent["robot"] if sent.kind == 1] == [True, False]
         answers = [sent.datagram for sent in network.sent["service"] if sent.kind == 2]
         assert answers == [True] * 3 + [False] * 3
-        assert network.parts_of[2] == network.expected(2)
+        network.check(2)
 
     def test_a_large_question_is_not_copied(self) -> None:
         """Nobody else is heard meanwhile."""
-        answers = ServiceExchange(Paths(lambda _: None, lambda _n, _m: None, lambda: 0))
+        answers = ServiceExchange(NOWHERE)
         message = bytearray(b"\1\0" + (1).to_bytes(4, "big") * 2 + b"\0\0" + bytes(2_000_000))
         arrived = answers.received(cast(bytes, message), datagram=False)
         assert arrived is not None and len(arrived.payload) == 2_000_000
@@ -489,8 +450,7 @@ class TestTheStream:
         network = Network(parts=3)
         network.answer = bytes(MAX_PAYLOAD_BYTES + 100)
         network.begin()
-        network.ask(1)
-        assert network.parts_of[1] == network.expected(1)
+        network.ask_all([1])
         answers = [sent.datagram for sent in network.sent["service"] if sent.kind == 2]
         assert answers == [False, False, False, True]
 
@@ -501,7 +461,7 @@ class TestTheStream:
         network.ask(1)
         network.datagrams = False
         assert network.ask(2) <= 1.0 + 2 * work_s
-        assert network.parts_of[2] == network.expected(2)
+        network.check(2)
         assert not network.is_open()
         assert network.ask(3) == pytest.approx(0.08 + 2 * work_s)
         network.datagrams = True
@@ -516,7 +476,7 @@ class TestTheStream:
         network.wait(0.7)
         network.datagrams = False
         network.run(lambda: 1 in network.done_at)
-        assert network.parts_of[1] == network.expected(1)
+        network.check(1)
 
     def test_silence_is_noticed_though_nothing_is_asked(self) -> None:
         network = Network()
@@ -534,7 +494,7 @@ class TestTheStream:
         began = network.now
         network.service.flush()
         network.run(lambda: 1 in network.done_at)
-        assert network.parts_of[1] == network.expected(1)
+        network.check(1)
         assert network.done_at[1] - began <= 0.05
 
     def test_what_was_passed_over_because_it_is_too_large(self) -> None:
@@ -609,15 +569,14 @@ class TestBounds:
     def test_answers_are_kept_until_the_robot_has_them(self) -> None:
         network = Network()
         network.begin()
-        for call in range(5 * MAX_CACHED_REQUESTS):
-            network.ask(call)
+        network.ask_all(range(5 * MAX_CACHED_REQUESTS))
         # All but the last are settled, so a late copy of an old question is no new one.
         late = b"\1\0" + b"\0\0\0\1" * 2 + b"\0\0" + bytes(75)
         assert network.service.received(late, datagram=True) is None
         assert len(network.asked) == 5 * MAX_CACHED_REQUESTS
 
     def test_parts_without_those_before_them_take_no_more_memory_than_the_bound(self) -> None:
-        robot = RobotExchange(Paths(lambda _: None, lambda _, __: None, lambda: 0))
+        robot = RobotExchange(NOWHERE)
         robot.send(7, bytes(2000), 0.0)
         part = bytes(MAX_REORDERED_BYTES // 4)
         found = []
@@ -628,7 +587,7 @@ class TestBounds:
         assert not robot._requests
 
     def test_no_more_answers_are_kept_than_the_bound(self) -> None:
-        answers = ServiceExchange(Paths(lambda _: None, lambda _n, _m: None, lambda: 0))
+        answers = ServiceExchange(NOWHERE)
         for number in range(1, 3 * MAX_CACHED_REQUESTS):
             question = b"\1\0" + number.to_bytes(4, "big") + b"\0\0\0\1\0\0x"
             assert answers.received(question, datagram=True) is not None
@@ -637,7 +596,7 @@ class TestBounds:
         assert answers.held_bytes == MAX_CACHED_REQUESTS * len(b"\0\0\0\1\0\0answer")
 
     def test_what_is_kept_for_a_robot_is_measured(self) -> None:
-        answers = ServiceExchange(Paths(lambda _: None, lambda _n, _m: None, lambda: 0))
+        answers = ServiceExchange(NOWHERE)
         size = 6 + len(b"answer")
 
         def ask(number: int, settled: int, *, datagram: bool = True) -> None:

@@ -1,7 +1,5 @@
 """An executive that asks for decisions: numbers, repeated calls, bad answers, waiting."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 

@@ -1,7 +1,5 @@
 """Expected return: what a look is worth, and what it costs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -240,6 +238,20 @@ class TestRollouts:
     ESTIMATES = np.array([[[0.7, 0.2], [-0.4, 0.9]], [[0.5, 0.6], [-0.6, 1.2]]])
     STATES = np.array([[0.5, 0.5], [-0.5, 1.0]])
 
+    def returns(
+        self,
+        problem: Any,
+        settings: PlanningSettings | None = None,
+        estimates: FloatArray = ESTIMATES,
+        states: FloatArray = STATES,
+        clouds: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return those of beliefs that have one particle each, at the estimate."""
+        if clouds is None:
+            clouds = estimates[:, :, np.newaxis]
+        settings = settings or settings_of()
+        return rollout_returns(problem, settings, states, estimates, clouds, 0, HYPOTHESES)
+
     @pytest.mark.parametrize("problem", [Dock(), Free(), TwoDocks(), Cliff(), FreeCliff()])
     @pytest.mark.parametrize("discount", [1.0, 0.9])
     def test_against_single_robots(self, problem: Dock, discount: float) -> None:
@@ -247,9 +259,7 @@ class TestRollouts:
         noiseless: Any = type("Noiseless", (type(problem),), {"move": lambda _, s, a, __: s + a})()
         settings = settings_of(discount=discount)
         clouds = self.ESTIMATES[:, :, np.newaxis] + np.array([[0.1, 0.0], [-0.1, 0.2]])
-        found = rollout_returns(
-            noiseless, settings, self.STATES, self.ESTIMATES, clouds, 0, HYPOTHESES
-        )
+        found = self.returns(noiseless, settings, clouds=clouds)
         gains = []
         for i in range(2):
             first, second = (
@@ -270,11 +280,8 @@ class TestRollouts:
                 asked.append(len(states))
                 return super().policy(states, stage)
 
-        estimates = self.ESTIMATES[:1]
         settings = settings_of(rollout_steps=1000)
-        rollout_returns(
-            Noted(), settings, self.STATES, estimates, estimates[:, :, np.newaxis], 0, HYPOTHESES
-        )
+        self.returns(Noted(), settings, self.ESTIMATES[:1])
         assert len(asked) <= settings.selector.rollout_sensing_steps * (
             settings.sensing_interval + 1
         )
@@ -318,43 +325,25 @@ class TestRollouts:
         return total
 
     def test_steps_instead_of_rewards(self) -> None:
-        settings = settings_of(rollout_reward="steps")
-        clouds = self.ESTIMATES[:, :, np.newaxis]
-        by_steps = rollout_returns(
-            Dock(), settings, self.STATES, self.ESTIMATES, clouds, 0, HYPOTHESES
-        )
-        without = rollout_returns(
-            Free(), settings_of(), self.STATES, self.ESTIMATES, clouds, 0, HYPOTHESES
-        )
-        assert by_steps.tobytes() == without.tobytes()
+        by_steps = self.returns(Dock(), settings_of(rollout_reward="steps"))
+        assert by_steps.tobytes() == self.returns(Free()).tobytes()
 
     def test_all_sensing_actions_have_the_same_noise(self) -> None:
         """Equal beliefs have equal returns, whatever the others are like."""
         estimates = np.concatenate([self.ESTIMATES, self.ESTIMATES[:1]])
         clouds = np.repeat(estimates[:, :, np.newaxis], 3, axis=2)
-        found = rollout_returns(
-            Dock(), settings_of(), self.STATES, estimates, clouds, 0, HYPOTHESES
-        )
+        found = self.returns(Dock(), None, estimates, clouds=clouds)
         assert found[0].tobytes() == found[2].tobytes()
         assert found[0].tobytes() != found[1].tobytes()
 
     def test_later_looks_have_a_price_too(self) -> None:
         """At each sensing step up to the goal the mean price: who is there sooner has fewer."""
         estimates = np.stack([self.STATES, self.STATES + np.array([1.0, 0.0])])
-        clouds = estimates[:, :, np.newaxis]
         found = []
         for price in (0.0, 3.0):
             problem: Any = type("Exact", (Free,), {"move": lambda _, s, a, __: s + a})()
             problem.sensing_costs = (price, 2.0 * price, 0.0)
-            returns = rollout_returns(
-                problem,
-                settings_of(interval=1),
-                self.STATES,
-                estimates,
-                clouds,
-                0,
-                HYPOTHESES,
-            )
+            returns = self.returns(problem, settings_of(interval=1), estimates)
             found.append(returns[0] - returns[1])
         assert found[0][0] == found[1][0] == 0.0  # the first robot is as soon there as the other
         assert found[0][1] > 1.0
@@ -368,9 +357,7 @@ class TestRollouts:
                 asked.append((states.shape, stages.shape))
                 return np.full(states.shape[0], 1000.0)
 
-        far = self.STATES + 50.0
-        clouds = self.ESTIMATES[:, :, np.newaxis]
-        found = rollout_returns(Told(), settings_of(), far, self.ESTIMATES, clouds, 0, HYPOTHESES)
+        found = self.returns(Told(), states=self.STATES + 50.0)
         # Known at steps 5, 10, 15 and 20 with the probabilities 1/4, 3/16, 9/64 and 27/64.
         steps = 5 / 4 + 10 * 3 / 16 + 15 * 9 / 64 + 20 * 27 / 64
         np.testing.assert_allclose(found, 1000.0 - steps, rtol=1e-12)
@@ -383,10 +370,8 @@ class TestRollouts:
                 known[changed][...] = 0
                 return np.zeros(known[0].shape[0])
 
-        clouds = self.ESTIMATES[:, :, np.newaxis]
-        states = self.STATES + 50.0
         with pytest.raises(ValueError, match="read-only"):
-            rollout_returns(InPlace(), settings_of(), states, self.ESTIMATES, clouds, 0, HYPOTHESES)
+            self.returns(InPlace(), states=self.STATES + 50.0)
 
     @pytest.mark.parametrize(
         ("function", "own", "message"),
@@ -402,21 +387,8 @@ class TestRollouts:
     )
     def test_what_breaks_the_contract_is_named(self, function: str, own: Any, message: str) -> None:
         broken: Any = type("Broken", (TwoDocks,), {function: own})()
-        clouds = self.ESTIMATES[:, :, np.newaxis]
         with pytest.raises(ProblemError, match=message):
-            rollout_returns(
-                broken, settings_of(), self.STATES, self.ESTIMATES, clouds, 0, HYPOTHESES
-            )
-
-    @pytest.mark.parametrize("function", ["policy", "move"])
-    def test_nothing_can_be_changed_in_place(self, function: str) -> None:
-        def in_place(_self: Dock, states: FloatArray, *_: object) -> FloatArray:
-            states += 1.0
-            return states
-
-        broken: Any = type("InPlace", (Dock,), {function: in_place})()
-        with pytest.raises(ValueError, match="read-only"):
-            choose(broken, settings_of(), belief_of(0.5, 0.5))
+            self.returns(broken)
 
 
 class TestSamples:
@@ -427,11 +399,8 @@ class TestSamples:
         # The second is worse by 1 without a doubt; the third by less than its error.
         assert expected_return._contenders(samples, [0, 1, 2, 3]) == [0, 2, 3]
         assert expected_return._contenders(samples, [1, 3])[-1] == 3
-
-    def test_equal_rows_are_not_contended(self) -> None:
+        # Equal rows are not contended; a single sample tells nothing about its error.
         assert expected_return._contenders(np.ones((3, 4)), [0, 1, 2]) == [0]
-
-    def test_a_single_sample_tells_nothing_about_its_error(self) -> None:
         assert expected_return._contenders(np.array([[1.0], [2.0]]), [0, 1]) == [0, 1]
 
     def test_paired_means(self) -> None:
@@ -470,31 +439,19 @@ class TestSensingCosts:
             sense(history, trial, np.array([0.5]), 0.0)
             assert history.rewards.total == -price
 
-    def test_a_price_alone_is_a_reward(self) -> None:
-        problem = Free()
-        problem.sensing_costs = (1.0, 1.0, 1.0)  # type: ignore[attr-defined]
-        simulator = SimulatorSettings(max_steps=10, sensing_intervals=4)
-        result = run_trial(
-            Planner(problem, settings_of(method="random", particles=30)),
-            simulator.seed,
-            0,
-            max_steps=simulator.max_steps,
-        )
-        assert result.reward == -float(result.sensing_decisions)
-
-    def test_free_looks_alone_are_a_reward_of_zero(self) -> None:
-        problem = Free()
-        simulator = SimulatorSettings(max_steps=10, sensing_intervals=4)
-        settings = settings_of(method="fixed", particles=30, sensing_action=2)
-        for costs, reward in (((1.0, 1.0, 0.0), 0.0), ((0.0, 0.0, 0.0), 0.0), (None, None)):
-            problem.sensing_costs = costs  # type: ignore[attr-defined]
-            assert (
-                run_trial(
-                    Planner(problem, settings), simulator.seed, 0, max_steps=simulator.max_steps
-                ).reward
-                == reward
-            )
-            assert Trial(Planner(problem, settings), 0, 0).rewards.total == reward
+    @pytest.mark.parametrize(
+        ("costs", "of_a_look"),
+        [((0.0, 0.0, 1.0), -1.0), ((1.0, 1.0, 0.0), 0.0), ((0.0, 0.0, 0.0), 0.0), (None, None)],
+    )
+    def test_a_price_alone_is_a_reward(self, costs: Any, of_a_look: float | None) -> None:
+        problem: Any = Free()
+        problem.sensing_costs = costs
+        planner = Planner(problem, settings_of(method="fixed", particles=30, sensing_action=2))
+        result = run_trial(planner, SimulatorSettings().seed, 0, max_steps=10)
+        assert result.sensing_decisions > 1
+        paid = None if of_a_look is None else of_a_look * result.sensing_decisions
+        assert result.reward == paid
+        assert Trial(planner, 0, 0).rewards.total == (None if paid is None else 0.0)
 
     @pytest.mark.parametrize("kind", [Dock, Sonar])
     def test_not_to_sense_is_as_an_observation_that_says_nothing(self, kind: type[Dock]) -> None:
@@ -523,13 +480,11 @@ class TestSensingCosts:
         assert sensing_costs(Priced(), optional=True).tolist() == [0.5, 0.25, 0.0, 0.0]
         assert sensing_costs(Dock(), otherwise=1.0).tolist() == [1.0, 1.0, 1.0]
         assert sensing_costs(Priced(), otherwise=1.0).tolist() == [0.5, 0.25, 0.0]
-
-    def test_none_is_free(self) -> None:
-        for costs in (None, (0.0, 0.0, 0.0), np.zeros(3), [0, 0, 0]):
-            problem = Dock()
-            problem.sensing_costs = costs  # type: ignore[attr-defined]
-            assert sensing_costs(problem).tolist() == [0.0, 0.0, 0.0]
         assert sensing_costs(Dock()).tolist() == [0.0, 0.0, 0.0]
+        for costs in (None, (0.0, 0.0, 0.0), np.zeros(3), [0, 0, 0]):
+            problem: Any = Dock()
+            problem.sensing_costs = costs
+            assert sensing_costs(problem).tolist() == [0.0, 0.0, 0.0]
 
     def test_the_greatest_price(self) -> None:
         problem = Dock()

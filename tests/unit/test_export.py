@@ -1,7 +1,5 @@
 """A recorded run as ROS 2 messages and as tables, read back by other people's readers."""
 
-from __future__ import annotations
-
 import csv
 import itertools
 import json
@@ -24,7 +22,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.typesys import Stores, get_typestore
-from tests.command_line import Said, run_here
+from tests.answers import answers_in
+from tests.command_line import Said, done_here, run_here
 
 import holdfast as hf
 from holdfast.config.loader import Configuration, load
@@ -34,7 +33,7 @@ from holdfast.journal.journal import Journal
 from holdfast.planning.belief import Belief
 from holdfast.planning.inputs import ActingRecord, Moved, Sensed, encode_floats
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.planner import Planner
+from holdfast.planning.planner import Planner, PlanningState
 from holdfast.reports.poses import PoseLayout, pose_layout
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 
@@ -43,7 +42,6 @@ problem: peg_in_hole_2d
 particle_filter: {num_particles: 25}
 simulator: {num_trials: 2, max_steps: 20, sensing_intervals: 3, seed: 5}
 """
-PROBLEMS = tuple(BUILT_IN)
 
 OWN_PROBLEM = '''
 import numpy as np
@@ -99,46 +97,34 @@ class World:
 """
 
 
-class Step(NamedTuple):
-    """What one step was, as an observer of the run itself saw it."""
-
-    trial: int
-    step: int
-    belief: Belief
-    true_state: np.ndarray
-    action: np.ndarray
-
-
 class Seen(TrialObserver):
-    """Keeps all of a trial."""
+    """Keeps all of a trial; the truths are those before each task action, and the last."""
 
     def __init__(self) -> None:
-        self.steps: list[Step] = []
         self.sensed_steps: list[SensingStep] = []
-        self.last: tuple[int, int, Belief, np.ndarray] | None = None
+        self.task_steps: list[TaskStep] = []
+        self.truths: list[np.ndarray] = []
         self.beliefs: list[tuple[int, int, str, Belief]] = []
-        self._true: Any = None
         self._environment: Any = None
 
     def trial_began(self, environment: Any, state: Any) -> None:
         self._environment = environment
-        self._true = environment.state.copy()
+        self.truths.append(environment.state.copy())
 
     def sensed(self, step: SensingStep) -> None:
         self.sensed_steps.append(step)
-        self.beliefs.append((step.before.trial, step.before.step, "sensing", step.before.belief))
+        self.note("sensing", step.before)
 
     def acted(self, step: TaskStep) -> None:
-        state = step.state
-        self.steps.append(
-            Step(state.trial, state.step, state.belief, self._true, step.executed.copy())
-        )
-        self.beliefs.append((state.trial, state.step, "acting", state.belief))
-        self._true = self._environment.state.copy()
+        self.task_steps.append(step)
+        self.note("acting", step.state)
+        self.truths.append(self._environment.state.copy())
 
     def trial_ended(self, state: Any, result: TrialResult) -> None:
-        self.last = (state.trial, state.step, state.belief, self._true)
-        self.beliefs.append((state.trial, state.step, "end", state.belief))
+        self.note("end", state)
+
+    def note(self, when: str, state: PlanningState) -> None:
+        self.beliefs.append((state.trial, state.step, when, state.belief))
 
 
 def seen_in(configuration: Configuration, trials: range) -> list[Seen]:
@@ -158,18 +144,29 @@ def seen_in(configuration: Configuration, trials: range) -> list[Seen]:
 class Place:
     """A directory in which runs are made and exported."""
 
-    def __init__(self, directory: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def __init__(
+        self, directory: Path, capsys: pytest.CaptureFixture[str], recorded: Path | None = None
+    ) -> None:
         self.directory = directory
         self._capsys = capsys
+        self._recorded = recorded
 
     def call(self, *words: str) -> Said:
         return run_here(self._capsys, self.directory, *words)
 
     def run(self, text: str, *options: str, code: int = 0) -> Path:
         (self.directory / "run.yaml").write_text(text)
-        said = self.call("run", "run.yaml", "--out", "run", "-q", *options)
+        run = self.directory / "run"
+        if text == PEG and not options and self._recorded:
+            shutil.copytree(self._recorded, run)
+            return run
+        said = self.call(*RUN, *options)
         assert said.code == code, said.stderr
-        return self.directory / "run"
+        return run
+
+    def run_cart(self, pose: str = "") -> Path:
+        (self.directory / "cart.py").write_text(OWN_PROBLEM.replace("POSE", pose))
+        return self.run(PEG.replace("peg_in_hole_2d", "cart:Cart"))
 
     def export(self, *options: str, code: int = 0) -> Said:
         said = self.call("export", "run", *options)
@@ -179,9 +176,21 @@ class Place:
         return said
 
 
+RUN = ("run", "run.yaml", "--out", "run", "-q")
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a run that tests copy."""
+    directory = tmp_path_factory.mktemp("recorded")
+    (directory / "run.yaml").write_text(PEG)
+    done_here(directory, RUN)
+    return directory / "run"
+
+
 @pytest.fixture
-def place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Place:
-    return Place(tmp_path, capsys)
+def place(tmp_path: Path, capsys: pytest.CaptureFixture[str], recorded: Path) -> Place:
+    return Place(tmp_path, capsys, recorded)
 
 
 class Message(NamedTuple):
@@ -229,30 +238,14 @@ def numbers(pose: Any) -> list[float]:
     return [point.x, point.y, point.z, turn.x, turn.y, turn.z, turn.w]
 
 
-def stamp_ns(header: Any) -> int:
-    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
-
-
-def different_beliefs(seen: list[Seen]) -> list[Belief]:
-    """Return the beliefs of trials in order; after sensing it is the same as when acting."""
-    return [belief for observer in seen for *_, belief in observer.beliefs]
-
-
-@pytest.fixture(scope="module", params=PROBLEMS)
+@pytest.fixture(scope="module", params=tuple(BUILT_IN))
 def built_in(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Configuration, Path, list[Seen]]]:
     directory = tmp_path_factory.mktemp("built_in")
+    export = ("export", "run", "--mcap", "run.mcap", "--csv", "tables", "-q")
     (directory / "run.yaml").write_text(PEG.replace("peg_in_hole_2d", request.param))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(directory)
-        from holdfast.cli.application import find_command
-
-        for words in (
-            ["run", "run.yaml", "--out", "run", "-q"],
-            ["export", "run", "--mcap", "run.mcap", "--csv", "tables", "-q"],
-        ):
-            assert find_command(words).run(words[1:]) == 0
+    done_here(directory, RUN, export)
     configuration = load(directory / "run.yaml")
     yield configuration, directory, seen_in(configuration, range(2))
 
@@ -272,14 +265,16 @@ class TestReadBack:
         messages = messages_in(directory, read)
         clouds = of_topic(messages, "/holdfast/particle_cloud")
         tables = of_topic(messages, "/holdfast/belief")
-        expected = different_beliefs(seen)
+        # After sensing it is the same as when acting.
+        expected = [belief for observer in seen for *_, belief in observer.beliefs]
         assert len(clouds) == len(tables) == len(expected) > 40
         layout = layout_of(configuration)
         for cloud, table, belief in zip(clouds, tables, expected, strict=True):
             found = np.array([numbers(pose) for pose in cloud.data.poses])
             assert np.array_equal(found, layout.poses(belief.states))
             assert cloud.data.header.frame_id == "task"
-            assert stamp_ns(cloud.data.header) == cloud.time_ns
+            stamp = cloud.data.header.stamp
+            assert 10**9 * stamp.sec + stamp.nanosec == cloud.time_ns
             particle, coordinates = table.data.layout.dim
             assert (particle.label, particle.size) == ("particle", 25)
             assert coordinates.label.endswith("; weight")
@@ -291,14 +286,10 @@ class TestReadBack:
         configuration, directory, seen = built_in
         messages = messages_in(directory, read)
         layout = layout_of(configuration)
-        rows = [
-            row
-            for observer in seen
-            for row in [
-                *((step.belief, step.true_state) for step in observer.steps),
-                observer.last[2:],
-            ]
-        ]
+        rows: list[tuple[Belief, np.ndarray]] = []
+        for observer in seen:
+            beliefs = [belief for *_, when, belief in observer.beliefs if when != "sensing"]
+            rows += zip(beliefs, observer.truths, strict=True)
         estimates = of_topic(messages, "/holdfast/estimate")
         truths = of_topic(messages, "/holdfast/truth")
         transforms = of_topic(messages, "/tf")
@@ -323,7 +314,7 @@ class TestReadBack:
         configuration, directory, seen = built_in
         messages = messages_in(directory, read)
         sensed = [step for observer in seen for step in observer.sensed_steps]
-        actions = [step.action.tolist() for observer in seen for step in observer.steps]
+        actions = [step.executed.tolist() for observer in seen for step in observer.task_steps]
         chosen = [message.data.data for message in of_topic(messages, "/holdfast/sensing_action")]
         assert chosen == [step.sensing_action for step in sensed]
         labels = [
@@ -351,8 +342,7 @@ class TestReadBack:
             if following is None or len(following.data.poses) < len(path.data.poses)
         ]
         for observer, end in zip(seen, ends, strict=True):
-            way = [step.true_state for step in observer.steps] + [observer.last[3]]
-            assert end == layout.poses(way).tolist()
+            assert end == layout.poses(observer.truths).tolist()
 
     def test_tables(self, built_in: Any) -> None:
         configuration, directory, seen = built_in
@@ -553,8 +543,7 @@ class TestOwnCode:
     def test_a_problem_says_its_pose_or_has_none(
         self, pose: str, positions: tuple[float, float, float] | None, place: Place, tmp_path: Path
     ) -> None:
-        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", pose))
-        place.run(PEG.replace("peg_in_hole_2d", "cart:Cart"))
+        place.run_cart(pose)
         said = place.export("--mcap", "run.mcap", *MINE)
         messages = by_mcap(tmp_path / "run.mcap")
         tables = of_topic(messages, "/holdfast/belief")
@@ -576,8 +565,7 @@ class TestOwnCode:
         self, place: Place, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         """Wherever a module of that name lies: where it did, beside the journal, or here."""
-        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
-        run = place.run(PEG.replace("peg_in_hole_2d", "cart:Cart"))
+        run = place.run_cart()
         ran = tmp_path / "ran"
         source = f"open({str(ran)!r}, 'w')\n"
         for directory in (tmp_path, run):
@@ -598,15 +586,6 @@ class TestOwnCode:
         assert len(list(opened.read())) == len(opened.trials)
         sys.modules.pop("cart", None)
         assert not ran.exists()
-
-    def test_a_module_is_looked_for_only_where_the_caller_says(
-        self, place: Place, tmp_path: Path
-    ) -> None:
-        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
-        place.run(PEG.replace("peg_in_hole_2d", "cart:Cart"))
-        (tmp_path / "elsewhere").mkdir()
-        options = ("--csv", "tables", "--problem-directory", "elsewhere")
-        assert "there is no module cart" in place.export(*options, code=2).stderr
 
     def test_in_a_world_of_ones_own(self, place: Place, tmp_path: Path) -> None:
         """What the world has shown is in the journal, of the trial that is not finished as well."""
@@ -661,8 +640,7 @@ class TestOwnCode:
 
 class TestDecisionsAreCompared:
     def test_another_problem_is_noticed(self, place: Place, tmp_path: Path) -> None:
-        (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
-        place.run(PEG.replace("peg_in_hole_2d", "cart:Cart"))
+        place.run_cart()
         (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", "").replace("0.3", "0.45"))
         said = place.export("--csv", "tables", "--mcap", "run.mcap", *MINE, code=2)
         assert "trial 0: the decision of step 0 differs when it is computed again" in said.stderr
@@ -682,12 +660,12 @@ class TestUnfinished:
         (run / "journal.bin").unlink()
         records: list[Any] = []
         sensed = {step.before.step: step for step in seen.sensed_steps}
-        for step in seen.steps[:7]:
-            if step.step in sensed:
-                records.append(sensed[step.step].sensed)
-            if step.step < 6:
-                records.append(ActingRecord(step.step, step.action.tobytes()))
-                records.append(Moved(step.step, None))
+        for number, step in enumerate(seen.task_steps[:7]):
+            if number in sensed:
+                records.append(sensed[number].sensed)
+            if number < 6:
+                records.append(ActingRecord(number, step.executed.tobytes()))
+                records.append(Moved(number, None))
         assert isinstance(records[-1], Sensed) == (6 in sensed)
         with Journal.create(run / "journal.bin", meta) as journal:
             journal.add(first)
@@ -697,9 +675,9 @@ class TestUnfinished:
         rows = [row for row in rows_of(tmp_path / "tables" / "steps.csv") if row["trial"] == "1"]
         performed = [row for row in rows if row["action_time"]]
         assert len(performed) == 6
-        for row, step in zip(performed, seen.steps, strict=False):
+        for row, truth in zip(performed, seen.truths, strict=False):
             labels = configuration.problem.state_labels
-            assert [float(row[f"true {label}"]) for label in labels] == step.true_state.tolist()
+            assert [float(row[f"true {label}"]) for label in labels] == truth.tolist()
         tables = of_topic(by_mcap(tmp_path / "run.mcap"), "/holdfast/belief")
         last = np.array(tables[-1].data.data).reshape(25, 4)
         if 6 in sensed:
@@ -717,27 +695,17 @@ class TestUnfinished:
 
 class TestRefusals:
     @pytest.mark.parametrize(
-        ("options", "message"),
+        ("line", "message"),
         [
-            ((), "nothing to write: give --mcap FILE, --csv DIR or --figure FILE"),
-            (("--csv", "there"), "there: holds files already; remove it, or choose another"),
-            (("--csv", "run.yaml"), "run.yaml: exists already; remove it, or choose another"),
-            (("--mcap", "there"), "there: exists already"),
-            (("--mcap", "no/run.mcap"), "there is no directory no"),
-            (("--csv", "one", "--mcap", "one"), "--mcap and --csv are both one; give two places"),
-            (("--csv", "one", "--trials", "5:"), "--trials is '5:'; allowed are one trial N, or"),
-            (("--csv", "one", "--trials", "5"), "has no trial 5 (--trials); it has 2 trials"),
-            (("--figure", "one.gif"), "--figure is 'one.gif'; allowed are names that end with .pd"),
-            (("--csv", "one", "--trials", "2:9"), "has no trial from 2 to 8 (--trials); it has 2"),
+            *answers_in("export_mistakes.txt"),
+            ("", "nothing to write: give --mcap FILE, --csv DIR or --figure FILE"),
         ],
     )
-    def test_options(
-        self, options: tuple[str, ...], message: str, place: Place, tmp_path: Path
-    ) -> None:
+    def test_options(self, line: str, message: str, place: Place, tmp_path: Path) -> None:
         place.run(PEG)
         (tmp_path / "there").mkdir()
         (tmp_path / "there" / "file").write_text("mine")
-        said = place.export(*options, code=2)
+        said = place.export(*line.split(), code=2)
         assert message in said.stderr
         assert (tmp_path / "there" / "file").read_text() == "mine"
         assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "run.yaml", "there"]

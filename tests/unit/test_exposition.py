@@ -1,7 +1,5 @@
 """Metrics in the text format: the histogram of durations, and those of this process."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """FairScheduler: who has much to do waits, by owners, and nobody waits for that."""
 
-from __future__ import annotations
-
 import asyncio
 
 import pytest

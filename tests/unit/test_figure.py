@@ -1,7 +1,5 @@
 """The picture of a trial."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 from typing import Any
@@ -118,10 +116,7 @@ class TestFigure:
         assert panel.get_ylabel() == label
         legend = panel.get_legend()
         assert legend is not None
-        assert [text.get_text() for text in legend.get_texts()] == [
-            "chosen",
-            "not chosen (hollow)",
-        ]
+        assert [text.get_text() for text in legend.get_texts()] == ["chosen", "not chosen (hollow)"]
 
     def test_a_problem_without_a_scene_and_without_scores_is_drawn(self, tmp_path: Path) -> None:
         (tmp_path / "sceneless.py").write_text(

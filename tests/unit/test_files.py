@@ -1,34 +1,13 @@
-"""Files: written completely or not at all; a pipe is no journal."""
-
-from __future__ import annotations
+"""Files: written completely or not at all."""
 
 import errno
 import os
-import sys
 from pathlib import Path
 
 import pytest
 
-from holdfast.cli import main
 from holdfast.errors import OutputError
 from holdfast.runtime.files import directory_beside, move_into_place, require_free, write_atomically
-
-
-def test_a_pipe_is_no_journal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    # An end that stays open, so that a reader that waits would hang, not fail.
-    held = os.open(tmp_path / "pipe", os.O_RDWR)
-    try:
-        pipe = str(tmp_path / "pipe")
-        monkeypatch.setattr(sys, "argv", ["holdfast", "compare", pipe, pipe])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        assert ended.value.code == 2
-        assert "is a pipe or device, not a journal" in capsys.readouterr().err
-    finally:
-        os.close(held)
 
 
 class TestMadeBesideItsPlace:

@@ -1,7 +1,5 @@
 """What identifies the code of a run, and how a difference is reported."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Frames: however a stream is cut, the same ones come out; and what is none is found at once."""
 
-from __future__ import annotations
-
 import msgspec
 import pytest
 

@@ -1,7 +1,5 @@
 """Garbage that refers to itself, collected by the event loop's thread alone."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 from collections.abc import Callable, Iterator

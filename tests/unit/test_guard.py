@@ -1,7 +1,5 @@
 """What is about decisions alone can open no socket and cannot sleep; what can is named."""
 
-from __future__ import annotations
-
 import runpy
 import socket
 import time

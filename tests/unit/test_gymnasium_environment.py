@@ -1,7 +1,5 @@
 """Environments of gymnasium as a robot's world."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from pathlib import Path
@@ -10,8 +8,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import yaml
 from gymnasium import spaces
 from tests import mountain_car
+from tests.answers import answers_in
 
 import holdfast as hf
 from holdfast.config.loader import load
@@ -303,29 +303,11 @@ class TestWhatIsShown:
 
 
 class TestWhatIsRefused:
-    @pytest.mark.parametrize(
-        ("arguments", "says"),
-        [
-            ({"env_id": "NoSuch-v0"}, "environment.arguments.env_id: NoSuch-v0: "),
-            ({"env_id": "no_such_module:Env-v0"}, "environment.arguments.env_id: no_such_module"),
-            ({"env_id": 3}, "environment.arguments.env_id is 3; it must be the id"),
-            ({"sensing": []}, r"environment.arguments.sensing is \[\]; it must have a list of"),
-            ({"sensing": [[0], [2]]}, r"sensing\[1\] is \[2\]; .* from 0 to 1, the coordinates"),
-            ({"sensing": "math"}, "environment.arguments.sensing: math is no module:function"),
-            ({"sensing": "math:sine"}, "math:sine is no module:function that is found"),
-            ({"sensing": "math:pi"}, "environment.arguments.sensing: math:pi is no function"),
-            ({"sensing_noise": [0.1]}, "sensing_noise has 1 entries; there are 2 sensing actions"),
-            ({"sensing_noise": [0.1, -1.0]}, r"sensing_noise\[1\] is -1.0; it must be a standard"),
-            ({"motion": [7]}, r"environment.arguments.motion is \[7\]; .* from 0 to 1"),
-            ({"motion_noise": "much"}, "environment.arguments.motion_noise is 'much'; it must be"),
-            ({"action": 3}, "environment.arguments.action is 3; it must be a function"),
-            ({"success": 3}, "environment.arguments.success is 3; it must be a function"),
-            ({"success": "math:nothing"}, "environment.arguments.success: math:nothing is no"),
-        ],
-    )
-    def test_arguments(self, arguments: dict[str, Any], says: str) -> None:
+    @pytest.mark.parametrize(("text", "says"), answers_in("gymnasium_mistakes.txt"))
+    def test_arguments(self, text: str, says: str) -> None:
+        arguments: Any = {"env_id": CAR, "sensing": [[0], [1]], **yaml.safe_load(f"{{{text}}}")}
         with pytest.raises(ConfigurationError, match=says):
-            hf.GymnasiumEnvironment(**{"env_id": CAR, "sensing": [[0], [1]], **arguments})
+            hf.GymnasiumEnvironment(**arguments)
 
     def test_sensing_actions_and_actions_are_the_problems(self) -> None:
         peg = hf.make_problem("peg_in_hole_2d")

@@ -1,7 +1,5 @@
 """Headers of ROS 1's connections, as bytes."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

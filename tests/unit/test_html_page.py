@@ -1,7 +1,5 @@
 """A page of one file: what others have written in it stays text."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """The report of a run, a comparison, a tuning or a study."""
 
-from __future__ import annotations
-
 import html
 import json
 import re

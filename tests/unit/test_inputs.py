@@ -1,7 +1,5 @@
 """Records of an unfinished trial: what is none is said to be none, whatever it is instead."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

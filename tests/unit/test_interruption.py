@@ -1,7 +1,5 @@
 """A computation ends at its next check, once nobody awaits it."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time
@@ -145,14 +143,6 @@ def test_one_that_is_set_before_its_time_is_over_was_not_too_long() -> None:
     with pytest.raises(InterruptedComputationError, match="nobody awaits"):
         interruption_error(interruption)
     assert not interruption.took_too_long
-
-
-def test_outside_the_context_nothing_ends() -> None:
-    points, rows = np.arange(600.0).reshape(200, 3), np.zeros((4, 200))
-    interruption = Interruption(0.0)
-    with contextlib.suppress(InterruptedComputationError):
-        interruption_error(interruption)
-    _kernel.entropies(points, rows, True, 0, 5, 1e-3, 0.0, 0.0, 1, (1.0,), np.empty(0))
 
 
 def test_few_particles_among_many_obstacles_leave_the_interpreter() -> None:

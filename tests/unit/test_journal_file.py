@@ -1,7 +1,5 @@
 """The file of a journal: found, of this form, and its frames as they were written."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -20,13 +18,18 @@ class TestFinding:
         assert find_journal(tmp_path, "compare") == find_journal(journal, "compare") == journal
 
     def test_what_is_no_run(self, tmp_path: Path) -> None:
+        os.mkfifo(tmp_path / "pipe")
+        # An end that stays open, so that a reader that waits would hang, not fail.
+        held = os.open(tmp_path / "pipe", os.O_RDWR)
         for run, message in (
             (tmp_path, "holds no journal.bin, so no run to compare"),
             (tmp_path / "missing", "no such directory or journal, so no run to compare"),
             (Path("/dev/null"), "is a pipe or device"),
+            (tmp_path / "pipe", "is a pipe or device"),
         ):
             with pytest.raises(OutputError, match=message):
                 find_journal(run, "compare")
+        os.close(held)
 
 
 @pytest.mark.parametrize("sizes", [(0, 1, 12), (1 << 18, 5, (1 << 18) - 12, 3), (700_000,) * 2])

@@ -1,7 +1,5 @@
 """What a tuning keeps while it runs, and how it goes on from there."""
 
-from __future__ import annotations
-
 import resource
 from pathlib import Path
 

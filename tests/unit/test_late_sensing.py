@@ -1,7 +1,5 @@
 """Sensing that takes time: on a thread, or by a world that shows it later."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any
 

@@ -1,9 +1,8 @@
 """The tree: each module has its tests, and each folder of the product its line in ARCHITECTURE."""
 
-from __future__ import annotations
-
 import ast
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -24,86 +23,10 @@ BESIDE = {
 }
 """What is no part of the product, and its tests."""
 
-WRONG_PROBLEMS = "tests/unit/test_problem_check.py tries it, by problems that are wrong"
-WITHOUT_TESTS = {
-    "__main__": "one line, which every process test runs",
-    "cli/doctor": "options and printing; tests/processes/test_robot_doctor.py runs it",
-    "errors": "types without behaviour",
-    "master/__main__": "one line, which calls the command",
-    "master/errors": "types without behaviour",
-    "protocol/effects": "two types; tests/unit/test_observation_warnings.py uses them",
-    "protocol/robot_events": "types without behaviour",
-    "reports/facts": "types without behaviour",
-    "robot/health": "tests/processes/test_unattended.py asks it over HTTP",
-    "ros/ros2/__main__": "one line, which tests/ros runs",
-    "robot/session_configuration": "one function; tests/unit/test_reference_decisions.py calls it",
-    "ros/ros2/bond": "needs ROS 2; tests/ros/test_ros2_node.py",
-    "ros/ros2/messages": "converts rclpy's messages, which only tests/ros has",
-    "tuning/check_process": "tests/processes/test_cli_check.py",
-    "tuning/contract_check": WRONG_PROBLEMS,
-    "tuning/findings": WRONG_PROBLEMS,
-    "tuning/sensor_check": WRONG_PROBLEMS,
-    "tuning/trial_check": WRONG_PROBLEMS,
-}
-"""Modules of the product that no test is named after, and why."""
-
-SIMULATED = "tests/simulation/test_world.py"
-PARTS = "lab/tests/test_parts.py"
-TASKS = "studies/tests/test_running.py"
-FIGURES = "studies/tests/test_command.py"
-ELSEWHERE = {
-    "lab": {
-        "chaos/series": "lab/tests/test_chaos_report.py",
-        "demo/narrator": "lab/tests/test_demo_timeline.py",
-        "demo/scenario": "lab/tests/test_demo_timeline.py",
-        "errors": PARTS,
-        "simulation/checked_memo": PARTS,
-        "simulation/checkers": PARTS,
-        "simulation/disk": "tests/scenarios/test_scenarios.py",
-        "simulation/environment_model": PARTS,
-        "simulation/event_queue": PARTS,
-        "simulation/exploration": PARTS,
-        "simulation/network": SIMULATED,
-        "simulation/peg_with_encoders": "tests/simulation/test_late.py",
-        "simulation/reference_runs": PARTS,
-        "simulation/robot_node": SIMULATED,
-        "simulation/schedule_draws": "lab/tests/test_simulation_schedule.py",
-        "simulation/service_node": SIMULATED,
-        "simulation/story": "tests/scenarios/test_scenarios.py",
-        "simulation/world": SIMULATED,
-        "testbed/faults": "lab/tests/test_chaos_schedule.py",
-        "testbed/in_process": "tests/contracts/test_transport_contract.py",
-        "testbed/records": "tests/unit/test_timings.py",
-        "testbed/reference_run": "lab/tests/test_chaos_command.py",
-    },
-    "studies": {
-        "__main__": FIGURES,
-        "busy_room": "tests/contracts/test_problem_contract.py",
-        "cases": "studies/tests/test_selectors.py",
-        "cloud_trials": "studies/tests/test_thesis_chapter_6.py",
-        "errors": TASKS,
-        "executors": TASKS,
-        "judged_study": "studies/tests/test_selectors.py",
-        "light_dark": "tests/contracts/test_problem_contract.py",
-        "offload_figures": FIGURES,
-        "parameters": "studies/tests/test_selectors.py",
-        "passer_by": "tests/golden/test_golden.py",
-        "plots": "studies/tests/test_results_page.py",
-        "priced_problems": "studies/tests/test_sensing_price.py",
-        "published_2017": "tests/oracles/test_published_2017.py",
-        "sensing_times": "studies/tests/test_offload_break_even.py",
-        "study": TASKS,
-        "tasks": TASKS,
-        "thesis_figures": FIGURES,
-        "thesis_measurements": "studies/tests/test_thesis_chapter_6.py",
-        "thesis_picture": FIGURES,
-        "trial_batches": TASKS,
-        "trial_files": "studies/tests/test_selectors.py",
-        "two_ends": "studies/tests/test_myopic.py",
-        "vdp_trials": "studies/tests/test_vdp_tag.py",
-    },
-}
-"""Modules beside the product that another test tries, as a part of something."""
+ELSEWHERE = tomllib.loads(
+    (Path(__file__).parent / "data" / "tested_elsewhere.toml").read_text(encoding="utf-8")
+)
+"""Modules that no test is named after, and why; or which one tries them, as a part of something."""
 
 
 def modules(package: Path = PACKAGE) -> list[str]:
@@ -128,7 +51,7 @@ def is_tested(module: str, known: list[str], tests: set[str]) -> bool:
 
 def test_each_module_has_a_test_named_after_it() -> None:
     untested = {each for each in MODULES if not is_tested(each, MODULES, TESTS)}
-    assert untested == set(WITHOUT_TESTS)
+    assert untested == set(ELSEWHERE["product"])
 
 
 @pytest.mark.parametrize("name", BESIDE)

@@ -1,7 +1,5 @@
 """The example of an agent that learns what to sense."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 from types import ModuleType

@@ -1,7 +1,5 @@
 """Bounds on the memory of all links: which link is ended when it runs out."""
 
-from __future__ import annotations
-
 from typing import cast
 
 from holdfast.transport.frames import HEADER_BYTES

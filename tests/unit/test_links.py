@@ -1,7 +1,5 @@
 """What a link's methods raise; the contracts of the links show that nobody else notices it."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 from typing import cast

@@ -1,14 +1,12 @@
 """The process that shows a run comes to the robot's own beliefs, and leaves out what is late."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from tests.recordings import configuration_of
+from tests.recordings import Journalling, configuration_of
 from tests.trial_inputs import come_late, sense
 
 from holdfast.config.loader import Configuration
@@ -18,7 +16,7 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.inputs import ActingRecord, Moved, Record, encode_floats
 from holdfast.planning.outcome import Ending
 from holdfast.planning.planner import Planner, digest
-from holdfast.planning.tracking import Trial
+from holdfast.planning.tracking import Trial, replay
 from holdfast.protocol.robot_events import Timing
 from holdfast.reports.facts import (
     EventFact,
@@ -62,24 +60,9 @@ class Steps(TrialObserver):
 def a_trial(configuration: Configuration, number: int) -> tuple[list[Record], Trial]:
     """Run a trial, and return its records as a robot journals them."""
     seed, max_steps = configuration.simulator.seed, configuration.simulator.max_steps
-    planner = Planner(configuration.problem, configuration.planning)
-    history = Trial(planner, seed, number)
-    world = SimulatedEnvironment(configuration.problem, seed, number)
-    records: list[Record] = []
-    while not world.is_done() and history.state.step < max_steps:
-        state = history.state
-        if planner.needs_sensing(state):
-            sensing_action, _ = planner.choose_sensing_action(state)
-            shown = np.asarray(world.perform_sensing(sensing_action), dtype=np.float64)
-            records.append(sense(history, sensing_action, shown, 0.0))
-        action, _ = planner.choose_task_action(history.state)
-        reward = world.perform(action)
-        assert reward is None or isinstance(reward, float)
-        performed = Moved(state.step, reward)
-        records += [ActingRecord(state.step, encode_floats(action)), performed]
-        history.pending = action
-        history.take(performed)
-    return records, history
+    planner, robot = Planner(configuration.problem, configuration.planning), Journalling()
+    run_trial(planner, seed, number, max_steps=max_steps, observer=robot)
+    return robot.records, replay(planner, seed, number, robot.records)
 
 
 def _known(values: FloatArray | None) -> FloatArray:

@@ -1,7 +1,5 @@
 """A robot that is watched: nothing that the other process does holds it up."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The event log: where lines go, and that no target hurts the process that writes to it."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """A loop on its own thread: results, limits and its end."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 

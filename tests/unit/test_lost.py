@@ -1,7 +1,5 @@
 """The sequential test: what it says, how soon, and how often wrongly."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from benchmarks.lost import trials

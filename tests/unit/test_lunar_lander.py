@@ -1,7 +1,5 @@
 """The example of gymnasium's LunarLander: what its model says, and how its trials end."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
