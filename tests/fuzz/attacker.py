@@ -348,6 +348,7 @@ def attacked(
         )
         attacker = site.process(
             sys.executable,
+            *("-X", "faulthandler"),  # its threads plan, decode and encode at once
             *("-m", "tests.fuzz.attacker", "--attack", service.endpoint, *mallory),
             *("--minutes", str(seconds / 60.0), "--seed", str(seed)),
             *("--ways", ",".join(ways)),

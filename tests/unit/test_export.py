@@ -587,6 +587,14 @@ class TestOwnCode:
         sys.modules.pop("cart", None)
         assert not ran.exists()
 
+    def test_a_module_is_looked_for_only_where_the_caller_says(
+        self, place: Place, tmp_path: Path
+    ) -> None:
+        place.run_cart()
+        (tmp_path / "elsewhere").mkdir()
+        options = ("--csv", "tables", "--problem-directory", "elsewhere")
+        assert "there is no module cart" in place.export(*options, code=2).stderr
+
     def test_in_a_world_of_ones_own(self, place: Place, tmp_path: Path) -> None:
         """What the world has shown is in the journal, of the trial that is not finished as well."""
         (tmp_path / "world.py").write_text(OWN_WORLD)
