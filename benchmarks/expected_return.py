@@ -135,7 +135,7 @@ def main() -> None:
     """Run what the file lacks, and write the comparisons beside it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/expected_return/trials.csv"))
-    parser.add_argument("--trials", type=int, default=12, help="0: tables alone")
+    parser.add_argument("--trials", type=int, default=40, help="0: tables alone")
     options = parser.parse_args()
     seed, known = known_trials()
     if options.trials:

@@ -17,7 +17,6 @@ BEFORE, AFTER = 10, 20
 
 def test_a_problem_of_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its class is found by its name, in the directory of the configuration."""
-    monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.delitem(sys.modules, "pool_peg", raising=False)
     for name, text in {
         "pool_peg.py": (

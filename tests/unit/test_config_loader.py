@@ -138,8 +138,6 @@ Write = Callable[[str], Path]
 
 @pytest.fixture
 def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
-    # A problem beside the file puts its directory on the import path; take it off again.
-    monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.delitem(sys.modules, "lamps", raising=False)
 
     def write_file(text: str) -> Path:

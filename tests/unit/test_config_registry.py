@@ -1,6 +1,5 @@
 """Problems by name."""
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,10 +14,7 @@ class TestRegistry:
         name = "holdfast.problems.capsule_robot:CapsuleRobot"
         assert registry.problem_class(name) is CapsuleRobot
 
-    def test_finds_a_file_in_the_directory(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(sys, "path", sys.path.copy())
+    def test_finds_a_file_in_the_directory(self, tmp_path: Path) -> None:
         (tmp_path / "a_problem_in_a_file.py").write_text("class Mine:\n    pass\n")
         name = "a_problem_in_a_file:Mine"
         with pytest.raises(UnknownProblemError, match="a_problem_in_a_file"):

@@ -61,9 +61,8 @@ number = 3
 
 class TestLoadEnvironment:
     @pytest.fixture
-    def loaded(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Loaded]:
+    def loaded(self, tmp_path: Path) -> Iterator[Loaded]:
         """Load what is named, beside a configuration file."""
-        monkeypatch.setattr(sys, "path", [*sys.path])
         (tmp_path / "robots.py").write_text(ROBOTS)
         (tmp_path / "broken_robots.py").write_text("1 + 'one'\n")
         (tmp_path / "lonely_robots.py").write_text("import absent_library\n")

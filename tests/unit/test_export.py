@@ -562,7 +562,7 @@ class TestOwnCode:
             assert np.array_equal(found, states[:, :1] * np.array(positions))
 
     def test_code_that_a_record_names_is_not_run_unasked(
-        self, place: Place, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+        self, place: Place, tmp_path: Path
     ) -> None:
         """Wherever a module of that name lies: where it did, beside the journal, or here."""
         run = place.run_cart()
@@ -581,7 +581,6 @@ class TestOwnCode:
         assert not ran.exists()
         (tmp_path / "cart.py").write_text(OWN_PROBLEM.replace("POSE", ""))
         place.export("--csv", "tables", "--problem-directory", str(tmp_path))
-        monkeypatch.setattr(sys, "path", sys.path.copy())
         opened = hf.open_run(run, problem_directory=tmp_path)
         assert len(list(opened.read())) == len(opened.trials)
         sys.modules.pop("cart", None)
