@@ -50,7 +50,7 @@ def path_entropy(context: Context) -> Result:
         for state in states:
             follow = functools.partial(
                 problem.world.follow,
-                problem._path_policy,
+                problem._path_policy.own,
                 state.belief.states,
                 state.stage,
                 offsets,
