@@ -18,6 +18,7 @@ import msgspec
 import msgspec.inspect
 from msgspec.inspect import FloatType, IntType, ListType, StrType, VarTupleType
 
+from holdfast.conversion import convert
 from holdfast.errors import InvalidValueError
 from holdfast.printable import brief, cut, did_you_mean
 
@@ -57,7 +58,7 @@ class Mismatch(NamedTuple):
 def find_mismatch(value: Any, annotation: Any, path: KeyPath = ()) -> Mismatch | None:
     """Return the first value, the innermost one, that msgspec does not convert to its type."""
     try:
-        msgspec.convert(value, annotation)
+        convert(value, annotation)
     except msgspec.ValidationError as error:
         reason = str(error)
     else:

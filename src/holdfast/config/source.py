@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from holdfast.config.yaml_document import Document
+from holdfast.conversion import convert
 from holdfast.errors import ConfigurationError
 from holdfast.planning import settings
 from holdfast.validation import KeyPath, close_match, dotted, field_names, find_mismatch, shown
@@ -136,7 +137,7 @@ class Source:
         """Return a section as its validated struct."""
         data = self.sections[name]
         try:
-            return msgspec.convert(data, schema)
+            return convert(data, schema)
         except msgspec.ValidationError as error:
             found = find_mismatch(data, schema, (name,))
             if found is None:  # only if a struct's own check is inconsistent

@@ -108,8 +108,9 @@ def ranges_of(numbers: Sequence[int]) -> tuple[tuple[int, int], ...]:
     return tuple(ranges)
 
 
+_EARLIER = msgspec.json.Decoder(tuple[EarlierCode, ...])
+
+
 def read_earlier(text: str | None) -> tuple[EarlierCode, ...]:
     """Read the note of a journal about earlier code."""
-    if text is None:
-        return ()
-    return msgspec.json.decode(text, type=tuple[EarlierCode, ...])
+    return _EARLIER.decode(text or "[]")

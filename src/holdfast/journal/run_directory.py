@@ -80,6 +80,7 @@ _DECISIONS = {
     None: "the state that a decision led to",
 }
 
+_SUMMARY = msgspec.json.Decoder(RunSummary)
 _MAX_SUFFIX = 10_000
 _MAX_UNUSED_BYTES = 1 << 22
 """Bound on a journal that holds a configuration and no trial."""
@@ -285,7 +286,7 @@ class RunDirectory:
         if len(self.journal.finished()) < trials:
             return None
         try:
-            summary = msgspec.json.decode((self.path / SUMMARY_NAME).read_bytes(), type=RunSummary)
+            summary = _SUMMARY.decode((self.path / SUMMARY_NAME).read_bytes())
         except (OSError, msgspec.DecodeError):
             return None
         return summary if summary.finished == summary.trials == trials else None

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
+from holdfast.conversion import convert
 from holdfast.errors import InvalidValueError
 
 MAX_PARTICLES = 10_000_000
@@ -480,7 +481,7 @@ def check_settings(settings: object, schema: type[SectionT], what: str = "settin
     except TypeError as error:
         raise InvalidValueError(f"{what}: {error}") from error
     try:
-        checked = msgspec.convert(plain, schema)
+        checked = convert(plain, schema)
     except msgspec.ValidationError as error:
         from holdfast.validation import dotted, find_mismatch
 

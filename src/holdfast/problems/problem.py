@@ -38,6 +38,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from holdfast.conversion import convert
 from holdfast.errors import ProblemError
 from holdfast.numerics.arrays import BoolArray, FloatArray, IntArray, plain, real_numbers
 from holdfast.numerics.randomness import Stream
@@ -135,7 +136,7 @@ _OF_STATE: Mapping[str, tuple[Any, str]] = {
 def _of_state(name: str, value: object) -> Any:
     kind, needed = _OF_STATE[name]
     try:
-        return msgspec.convert(plain(value), kind)
+        return convert(plain(value), kind)
     except msgspec.ValidationError:
         raise ProblemError(f"{name} of a Scene is {brief(value)}: must be {needed}") from None
 

@@ -18,6 +18,7 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar
 import msgspec
 import numpy as np
 
+from holdfast.conversion import convert
 from holdfast.errors import InvalidValueError
 from holdfast.numerics import reproducible as numerics
 from holdfast.numerics.arrays import FloatArray, IntArray, KeepsReadOnly
@@ -74,7 +75,7 @@ def validated(section: str, settings: StructT) -> StructT:
     msgspec checks what it decodes, not what a constructor is given.
     """
     try:
-        return msgspec.convert(msgspec.to_builtins(settings), type(settings))
+        return convert(msgspec.to_builtins(settings), type(settings))
     except msgspec.ValidationError as error:
         raise InvalidValueError(f"{section}: {error}") from error
 
@@ -107,8 +108,8 @@ class RigidBodyProblem(KeepsReadOnly, ProblemBase):
         """Build the problem from plain data; ``msgspec.ValidationError`` if it does not fit."""
         make: Callable[..., Self] = cls
         return make(
-            msgspec.convert(model, cls.Model),
-            msgspec.convert(state_space_planner, cls.StateSpacePlanner),
+            convert(model, cls.Model),
+            convert(state_space_planner, cls.StateSpacePlanner),
         )
 
     def __init__(

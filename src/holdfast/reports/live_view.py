@@ -30,6 +30,8 @@ _START_S = 60.0
 _CLOSE_S = 10.0
 """Longest wait for the rest to be drawn, when the run is over."""
 
+_REPORT = msgspec.msgpack.Decoder(FollowerReport)
+
 _Work: TypeAlias = Callable[..., None]
 
 
@@ -85,7 +87,7 @@ class LiveView:
         message = self._worker.receive()
         if message is None:
             return FollowerReport(f"its process {self._worker.how_it_ended()[0]}")
-        return msgspec.msgpack.decode(message, type=FollowerReport)
+        return _REPORT.decode(message)
 
     def _wait(self) -> None:
         report = self._report()

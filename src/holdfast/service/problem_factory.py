@@ -38,8 +38,7 @@ class ProblemFactory:
             for name, each in self._classes.items()
         }
         self._names: frozenset[str] | None = None
-        # msgspec (0.22) inspects a struct's fields when the first one is made, and crashes if a
-        # second thread makes one at the same time.
+        # Users' classes need not bear two threads at once.
         self._lock = threading.Lock()
 
     def __call__(self, session_configuration: SessionConfiguration) -> Problem:

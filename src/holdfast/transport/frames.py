@@ -76,6 +76,9 @@ class _Version(msgspec.Struct):
     release: str = "unknown"
 
 
+_HELLO: Final = msgspec.msgpack.Decoder(Hello)
+_VERSION: Final = msgspec.msgpack.Decoder(_Version)
+
 _Form = TypeVar("_Form")
 
 
@@ -104,14 +107,14 @@ def read_goodbye(payload: bytes) -> str:
 
 def decode_hello(payload: bytes) -> Hello:
     """Decode the peer's hello; raise FrameError if it is of another version, or malformed."""
-    version = _decoded(payload, _Version)
+    version = _decoded(payload, _VERSION)
     if version.version != WIRE_VERSION:
         raise FrameError(
             f"is holdfast {one_line(version.release[:40])} with version {version.version} of "
             f"the wire; here is holdfast {__version__} with version {WIRE_VERSION}: install "
             "the same release at both ends"
         )
-    hello = _decoded(payload, Hello)
+    hello = _decoded(payload, _HELLO)
     try:
         check_name("incarnation", hello.incarnation)
         if hello.role == "service" or hello.name:
@@ -125,9 +128,9 @@ def decode_hello(payload: bytes) -> Hello:
     return hello
 
 
-def _decoded(payload: bytes, form: type[_Form]) -> _Form:
+def _decoded(payload: bytes, decoder: msgspec.msgpack.Decoder[_Form]) -> _Form:
     try:
-        return msgspec.msgpack.decode(payload, type=form)
+        return decoder.decode(payload)
     except Exception as error:  # noqa: BLE001 - decoding may raise anything
         raise FrameError(f"sends a malformed hello: {one_line(str(error))}") from None
 

@@ -12,6 +12,7 @@ from typing import IO, Any, NamedTuple
 
 import msgspec
 
+from holdfast.conversion import convert
 from holdfast.errors import OutputError
 from holdfast.journal.run_directory import first_difference
 from holdfast.printable import csv_rows
@@ -130,6 +131,6 @@ def _rows_of(lines: Iterable[str]) -> Iterator[TrialRow]:
         with contextlib.suppress(ValueError, csv.Error, msgspec.ValidationError):
             ((*cells, reward, decision_ms, seconds),) = csv.reader([line])
             plain = [*cells, float(reward) if reward else None, decision_ms, seconds]
-            row = msgspec.convert(plain, TrialRow, strict=False)
+            row = convert(plain, TrialRow, strict=False)
             if 0.0 <= row.decision_ms + row.seconds < math.inf:
                 yield row

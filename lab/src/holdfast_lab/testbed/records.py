@@ -14,6 +14,7 @@ from typing import IO, Any, NamedTuple
 
 import msgspec
 
+from holdfast.conversion import convert
 from holdfast.protocol.question import OWN_PLANNER
 
 
@@ -90,7 +91,7 @@ class DecisionTable:
                 continue
             row = dict(zip(self._columns, fields, strict=True))
             values = [time_of(row["time"]), *(row[name] for name in Decision._fields[1:])]
-            self.rows.append(msgspec.convert(values, Decision, strict=False))
+            self.rows.append(convert(values, Decision, strict=False))
 
     def close(self) -> None:
         """Close the file."""
