@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
@@ -118,14 +119,19 @@ def test_what_ends_or_hangs_the_process(
 
 def test_a_wrong_problem_is_not_tuned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     name = written(tmp_path, "Raised", RAISES)
-    (tmp_path / "run.yaml").write_text(f"problem: {name}\n")
-    said = run_here(capsys, tmp_path, "tune", "run.yaml", "--budget", "10s")
+    (tmp_path / "run.yaml").write_text("problem: peg_in_hole_2d\n")
+    words = ("run.yaml", "--set", "particle_filter.num_particles=40", "--problem", name)
+    said = run_here(capsys, tmp_path, "tune", *words, "--budget", "10s")
     assert said.code == 2
-    assert "holdfast: error: contract: move raised KeyError: 'wheel'. holdfast check" in said.stderr
+    command = shlex.join(["holdfast", "check", *words])
+    assert f"contract: move raised KeyError: 'wheel'. {command} says more of 1 er" in said.stderr
     assert "--no-check (check=False) tunes all the same" in said.stderr
     assert not (tmp_path / "runs").exists()
-    with pytest.raises(ProblemError, match="move raised KeyError"):
-        hf.tune(tmp_path / "run.yaml", budget_s=10.0)
+    again = run_here(capsys, tmp_path, "check", *words, "--budget", "1")
+    assert (again.code, "KeyError: 'wheel'" in again.stdout) == (1, True)
+    assert run_here(capsys, tmp_path, "check", name, *words[-2:]).code == 2
+    with pytest.raises(ProblemError, match=r"move raised KeyError.*holdfast\.check_problem says"):
+        hf.tune(hf.load_configuration(tmp_path / "run.yaml", problem=name), budget_s=10.0)
 
 
 def test_what_is_no_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

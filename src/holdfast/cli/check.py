@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from holdfast.cli.exit_codes import EXIT_DIFFERENT, ended_by_signals
 from holdfast.cli.overrides import combined, overrides_of
-from holdfast.errors import ConfigurationError
+from holdfast.errors import ConfigurationError, InvalidValueError
 from holdfast.printable import printable
 from holdfast.runtime import command_line
 
@@ -38,7 +38,8 @@ class CheckOptions(command_line.Options):
     exit_codes: ClassVar = {0: "no error, perhaps warnings", 1: "an error in the problem"}
     needs_arguments = True
 
-    problem: str = command_line.argument("PROBLEM", "Configuration file, name, or module:Class.")
+    of: str = command_line.argument("PROBLEM", "Configuration file, name, or module:Class.")
+    problem: str | None = command_line.problem_option()
     assignments: tuple[str, ...] = command_line.set_option(
         "model.width=0.3", instead_of="the file's, or of the default"
     )
@@ -84,10 +85,10 @@ def main(arguments: Sequence[str]) -> int:
     line = progress_line(len(CHECKS), quiet=options.quiet or options.json, noun="check")
     names = list(CHECKS)
     given = combined(overrides_of(options, options.assignments))
-    line.start(f"checking {options.problem}", 0, "")
+    line.start(f"checking {options.problem or options.of}", 0, "")
     try:
         found = check_apart(
-            functools.partial(_configuration, options.problem, given),
+            functools.partial(_configuration, options.of, options.problem, given),
             seed=options.seed,
             budget_s=options.budget,
             trials=options.trials,
@@ -109,17 +110,19 @@ def main(arguments: Sequence[str]) -> int:
     return EXIT_DIFFERENT if errors else 0
 
 
-def _configuration(problem: str, given: Mapping[str, Any]) -> Configuration:
+def _configuration(of: str, problem: str | None, given: Mapping[str, Any]) -> Configuration:
     """Return the configuration of a file, or one of defaults for a problem's name."""
     from holdfast.config.loader import Configuration, load
     from holdfast.config.source import put_at
 
-    if problem.endswith((".yaml", ".yml")) or Path(problem).is_file():
-        return load(Path(problem).absolute(), overrides=given)
-    sections: dict[str, object] = {"problem": problem}
+    if of.endswith((".yaml", ".yml")) or Path(of).is_file():
+        return load(Path(of).absolute(), problem=problem, overrides=given)
+    if problem is not None:
+        raise InvalidValueError(f"--problem {problem}: {of} is no file; name one problem alone")
+    sections: dict[str, object] = {"problem": of}
     for name, value in given.items():
         put_at(sections, name, value)
-    path = str(Path.cwd() / problem.replace("/", "_"))
+    path = str(Path.cwd() / of.replace("/", "_"))
     try:
         return Configuration.from_plain({"path": path, "configuration": sections})
     except ConfigurationError as error:

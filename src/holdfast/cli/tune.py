@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -143,7 +144,9 @@ def main(arguments: Sequence[str]) -> int:
     with goes_on(options if options.resume else None, "tune"):
         configuration = load(path, problem=options.problem, overrides=given)
     if options.check and not options.resume:
-        require_right(configuration, budget_s, warn)
+        same = {"configuration", "assignments", "problem", "problem_directory"}
+        words = options.words(*(options.table().keys() - same))
+        require_right(configuration, budget_s, warn, shlex.join(["holdfast", "check", *words]))
     if options.resume:
         if options.out is None or not (options.out / TRIALS_NAME).is_file():
             raise InvalidValueError(f"--resume needs --out DIR, of a tuning that has {TRIALS_NAME}")

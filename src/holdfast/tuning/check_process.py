@@ -77,10 +77,11 @@ def require_right(
     configuration: Configuration,
     budget_s: float,
     on_warning: Callable[[Finding], None] = lambda _: None,
+    check: str = "holdfast.check_problem",
 ) -> None:
     """Check a problem before it is tuned, for a tenth of that budget and at most 20 s.
 
-    ProblemError if it finds an error.
+    ProblemError if it finds an error, with how to ``check`` the same at length.
     """
     load = functools.partial(Configuration.from_plain, configuration.plain())
     errors = []
@@ -91,9 +92,8 @@ def require_right(
             errors.append(each)
     if errors:
         raise ProblemError(
-            f"{errors[0].check}: {errors[0].seen}. holdfast check {configuration.path} says more "
-            f"of {len(errors)} error{'s' * (len(errors) > 1)}; --no-check (check=False) tunes all "
-            "the same"
+            f"{errors[0].check}: {errors[0].seen}. {check} says more of {len(errors)} error"
+            f"{'s' * (len(errors) > 1)}; --no-check (check=False) tunes all the same"
         )
 
 
