@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+from typing import Any
 
 import pytest
 
@@ -63,3 +64,34 @@ def test_after_the_end_calls_do_nothing_and_waits_have_ended() -> None:
     assert told
     thread.close(PATIENCE_S)
     thread.call(pytest.fail, "it was called")
+
+
+def test_who_comes_while_the_loop_closes_does_not_wait_for_ever(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    thread = LoopThread("the-loop")
+    begun, asked, ended = threading.Event(), threading.Event(), threading.Event()
+
+    def run() -> None:
+        with pytest.raises(TransportError, match="it is closed"):
+            thread.run(asyncio.Event().wait())
+        ended.set()
+
+    async def wait() -> None:
+        begun.set()
+        try:
+            await asyncio.Event().wait()
+        finally:
+            threading.Thread(target=run, daemon=True).start()
+            assert asked.wait(PATIENCE_S)
+
+    def submit(coroutine: Any, loop: Any, real: Any = asyncio.run_coroutine_threadsafe) -> Any:
+        future = real(coroutine, loop)
+        asked.set()
+        return future
+
+    asyncio.run_coroutine_threadsafe(wait(), thread._loop)
+    assert begun.wait(PATIENCE_S)
+    monkeypatch.setattr(asyncio, "run_coroutine_threadsafe", submit)
+    thread.close(PATIENCE_S)
+    assert ended.wait(PATIENCE_S)

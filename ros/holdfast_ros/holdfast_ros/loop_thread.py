@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import threading
 from collections.abc import Callable, Coroutine
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, Future, InvalidStateError
 from typing import Any, TypeVar
 
 from holdfast.errors import TransportError
@@ -19,6 +19,7 @@ class LoopThread:
 
     def __init__(self, name: str) -> None:
         self._loop = asyncio.new_event_loop()
+        self._awaited: set[Future[Any]] = set()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -27,10 +28,13 @@ class LoopThread:
 
         Raises TransportError if it takes longer, or this is closed before.
         """
-        if self._loop.is_closed():
+        try:
+            future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+        except RuntimeError:
             coroutine.close()
-            raise TransportError("it is closed")
-        future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+            raise TransportError("it is closed") from None
+        self._awaited.add(future)
+        self._end_what_is_lost()
         try:
             return future.result(within_s)
         except TimeoutError:
@@ -38,6 +42,7 @@ class LoopThread:
         except CancelledError:
             raise TransportError("it is closed") from None
         finally:
+            self._awaited.discard(future)
             future.cancel()
 
     def call(self, function: Callable[..., object], *arguments: object) -> None:
@@ -53,3 +58,10 @@ class LoopThread:
     def _run(self) -> None:
         with asyncio.Runner(loop_factory=lambda: self._loop) as runner:  # its end cancels all tasks
             runner.get_loop().run_forever()
+        self._end_what_is_lost()
+
+    def _end_what_is_lost(self) -> None:
+        """End the waits for what was to run while the loop closed, once it is closed."""
+        for future in tuple(self._awaited) if self._loop.is_closed() else ():
+            with contextlib.suppress(InvalidStateError):
+                future.set_exception(TransportError("it is closed"))
