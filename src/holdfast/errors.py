@@ -10,6 +10,7 @@ from __future__ import annotations
 import copyreg
 import os
 import traceback
+from errno import EDQUOT, ENOSPC
 
 
 class HoldfastError(Exception):
@@ -81,8 +82,11 @@ class RunError(HoldfastError):
     """
 
     def __init__(self, error: HoldfastError, command: str | None, exit_code: int = 2) -> None:
-        super().__init__(f"{error}\nGo on with: {command}" if command else str(error))
-        self.reason = str(error)
+        cause: BaseException | None = error
+        while cause is not None and getattr(cause, "errno", None) not in (ENOSPC, EDQUOT):
+            cause = cause.__cause__
+        self.reason = f"{error}; make room on the disk first" if cause else str(error)
+        super().__init__(f"{self.reason}\nGo on with: {command}" if command else self.reason)
         self.command = command
         self.exit_code = exit_code
 

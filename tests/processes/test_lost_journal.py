@@ -217,7 +217,8 @@ class TestCannotBeWritten:
         out.mkdir()
         robot = site.run(story.file, command=in_namespace(SMALL, out))
         assert robot.wait() == 4, robot.account()
-        assert f"{journal_of(robot)}: cannot be written: No space left on device" in robot.output
+        assert f"{journal_of(robot)}: cannot be written: No space left on" in robot.output
+        assert "device; make room on the disk first\nGo on with: " in robot.output
         assert "--resume" in robot.output
         assert 0 < story.world.step < LONG_STEPS
         story.finish(site.run(story.file, out="out-kept", resume=True))

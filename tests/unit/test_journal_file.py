@@ -56,12 +56,14 @@ def test_another_form_is_refused(tmp_path: Path) -> None:
     Journal.create(path, {}).close()
     data = path.read_bytes()
     for header, message in (
-        (b"", "is empty"),
+        (b"", "is empty, so not a journal; name the directory"),
         (b"no journal at all", "is not a journal"),
         (data[:17] + b"55" + data[19:], "journal version '55'; this holdfast reads version 4"),
     ):
         path.write_bytes(header)
         for opens in (Journal.open, Journal.read):
-            with pytest.raises(OutputError, match=message):
+            with pytest.raises(OutputError, match=message) as raised:
                 opens(path)
+            # Who only reads begins no run.
+            assert ("start anew" in str(raised.value)) == (opens == Journal.open)
         assert path.read_bytes() == header

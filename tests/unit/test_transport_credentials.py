@@ -111,8 +111,8 @@ class TestLoading:
     @pytest.mark.parametrize(
         ("name", "role", "reason"),
         [
-            ("robot", "service", r"robot/certificate\.pem: is not for a service"),
-            ("service", "robot", r"service/certificate\.pem: is not for a robot"),
+            ("robot", "service", r"robot/certificate\.pem: is not for a service; a service"),
+            ("service", "robot", "'holdfast keys DIR' makes DIR/robot"),
             (
                 "expired_robot",
                 "robot",
@@ -307,7 +307,7 @@ class TestOnRealLinks:
                 "expired by the clock there; 'holdfast keys DIR --renew --robot NAME'",
             ),
             ("future_robot", "it is not valid yet by the clock there"),
-            ("service", "it is not for a robot"),
+            ("service", "it is not for a robot; a robot shows its own"),
             ("two_names_robot", "which has a certificate that has 2 common names, and must have"),
         ],
     )
@@ -325,7 +325,7 @@ class TestOnRealLinks:
     @pytest.mark.parametrize(
         ("name", "reason"),
         [
-            ("robot", "is not for a service"),
+            ("robot", "is not for a service; a service"),
             ("foreign_service", "was not signed by the authority in authority.pem"),
             ("expired_service", "has expired"),
             ("future_service", "is not valid yet; is a clock wrong?"),

@@ -126,11 +126,12 @@ class JournalFile:
 
     def __init__(self, path: Path, flags: int, name: Path | None = None) -> None:
         self.path = path
+        self._writes = bool(flags & os.O_RDWR)
         self._boot = _checksum((boot_id() or os.urandom(16).hex()).encode())
         self.descriptor = -1
         try:
             self.descriptor = os.open(name or path, flags | os.O_CLOEXEC, 0o666)
-            if flags & os.O_RDWR:
+            if self._writes:
                 fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 _written_here.add(self)
         except BlockingIOError:
@@ -138,7 +139,7 @@ class JournalFile:
             raise OutputError(f"{path}: another process is using this run") from None
         except OSError as error:
             self.close()
-            what = "written" if flags & os.O_RDWR else "read"
+            what = "written" if self._writes else "read"
             raise OutputError(f"{path}: cannot be {what}: {error.strerror}") from error
 
     def close(self) -> None:
@@ -163,17 +164,15 @@ class JournalFile:
         header = os.pread(self.descriptor, len(_HEADER), 0)
         if header == _HEADER:
             return
-        if not header:
-            raise OutputError(f"{self.path}: is empty, so no journal of a run; {START_ANEW}")
+        run = f"the directory of a run, or its {JOURNAL_NAME}"
+        anew = f", or {START_ANEW}" if self._writes else ""  # a reader begins no run
         if not header.startswith(_MAGIC):
-            raise OutputError(
-                f"{self.path}: is not a journal; name the directory of a run, or its "
-                f"{JOURNAL_NAME}, or {START_ANEW}"
-            )
+            what = "not" if header else "empty, so not"
+            raise OutputError(f"{self.path}: is {what} a journal; name {run}{anew}")
         version = header[len(_MAGIC) :].rstrip(b"\n\0").decode("ascii", "replace")
         raise OutputError(
-            f"{self.path}: journal version {version!r}; this holdfast reads version {_VERSION}; go "
-            f"on with the holdfast that made it, or {START_ANEW}"
+            f"{self.path}: journal version {version!r}; this holdfast reads version {_VERSION}; "
+            f"use the holdfast that made it{anew}"
         )
 
     def append(self, position: Position, payloads: Sequence[bytes]) -> Position:

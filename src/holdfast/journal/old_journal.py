@@ -21,7 +21,7 @@ from typing import Any
 import msgspec
 
 from holdfast.errors import OutputError
-from holdfast.journal.journal_file import START_ANEW, Entry, Finished, Notes, Steps, damaged, packed
+from holdfast.journal.journal_file import Entry, Finished, Notes, Steps, damaged, packed
 from holdfast.printable import brief
 
 _SCHEMA_VERSION = "3"
@@ -84,7 +84,7 @@ class _Rows:
         if version != _SCHEMA_VERSION:
             raise OutputError(
                 f"{self._path}: schema version {version}; this holdfast reads version "
-                f"{_SCHEMA_VERSION}; go on with the holdfast that made it, or {START_ANEW}"
+                f"{_SCHEMA_VERSION}; use the holdfast that made it"
             )
         records = list(self._steps())
         if notes.pop("steps_counted", "0") == "1" and records and not self._has_all(records):

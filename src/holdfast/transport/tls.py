@@ -39,10 +39,9 @@ _ONE_AUTHORITY = "; both ends need files of one 'holdfast keys DIR'"
 
 REMEDIES = {
     10: "; 'holdfast keys DIR --renew --{role} NAME' makes another",
-    18: _ONE_AUTHORITY,
-    19: _ONE_AUTHORITY,
-    20: _ONE_AUTHORITY,
+    **dict.fromkeys((7, 18, 19, 20, 21), _ONE_AUTHORITY),
     23: "; 'holdfast keys DIR --rotate --{role} NAME' makes a new key",
+    26: "; a {role} shows its own: 'holdfast keys DIR' makes DIR/{role}",
 }
 """For a certificate, by OpenSSL's error numbers."""
 
@@ -51,7 +50,7 @@ _ALERTS = {
     "CERTIFICATE_REVOKED": f"it has been revoked{REMEDIES[23]}",
     "UNKNOWN_CA": f"it was not signed by the authority in {AUTHORITY_FILE} there{_ONE_AUTHORITY}",
     "CERTIFICATE_REQUIRED": "there is none, and one is required",
-    "UNSUPPORTED_CERTIFICATE": "it is not for a {role}",
+    "UNSUPPORTED_CERTIFICATE": f"it is not for a {{role}}{REMEDIES[26]}",
     "DECRYPT_ERROR": "this end's key is not the certificate's",
     "BAD_CERTIFICATE": "it is not valid yet by the clock there, or is malformed",
 }
