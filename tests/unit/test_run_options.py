@@ -19,6 +19,7 @@ def test_the_command_that_goes_on_can_be_given() -> None:
     assert (again.configuration, again.out, again.resume) == (*places, True)
 
 
-def test_a_bad_address_is_named_once() -> None:
-    with pytest.raises(OptionError, match=r"^--health is 'ten': port 'ten' is not a whole number"):
-        RunOptions.parse("run", ["x.yaml", "--health", "ten"])
+@pytest.mark.parametrize(("text", "shown"), [("ten", "'ten'"), ("t" * 90, f"'{'t' * 76}[.]{{3}}")])
+def test_a_bad_address_is_named_once(text: str, shown: str) -> None:
+    with pytest.raises(OptionError, match=f"^--health is {shown}: port {shown} is not a whole"):
+        RunOptions.parse("run", ["x.yaml", "--health", text])

@@ -19,6 +19,7 @@ from holdfast.config.user_code import account_of_user_error
 from holdfast.errors import HoldfastError, InvalidValueError, ProblemError
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.planner import Planner, PlanningState
+from holdfast.printable import brief
 from holdfast.robot.environment import is_no_reading
 from holdfast.robot.session_configuration import session_configuration_of
 
@@ -101,7 +102,7 @@ class ActiveSensing:
         if request.configuration not in ("", self.configuration):
             return self.refusal(
                 ErrorCode.OTHER_CONFIGURATION,
-                f"configuration {request.configuration!r:.60} was asked for; this service has "
+                f"configuration {brief(request.configuration)} was asked for; this service has "
                 f"{self.configuration} ({self._problem_name})",
             )
         try:

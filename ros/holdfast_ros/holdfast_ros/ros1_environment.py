@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import NamedTuple, Self
 
 from holdfast.errors import TransportError
+from holdfast.printable import brief
 from ros1_master_guard.headers import host_and_port_of
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
@@ -42,7 +43,7 @@ class RosEnvironment(NamedTuple):
         """
         master = environment.get("ROS_MASTER_URI") or "http://localhost:11311"
         if host_and_port_of(master, "http") is None:
-            raise TransportError(f"ROS_MASTER_URI is {master!r:.200}; expected http://HOST:PORT")
+            raise TransportError(f"ROS_MASTER_URI is {brief(master)}; expected http://HOST:PORT")
         own = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP") or ""
         is_local = own == "localhost" or own.startswith("127.")
         namespace = environment.get("ROS_NAMESPACE", "").strip("/")
@@ -57,7 +58,7 @@ class RosEnvironment(NamedTuple):
         """Return the absolute name; raise TransportError if it is malformed."""
         if len(name) > _MAX_NAME or not _NAME.fullmatch(name.removeprefix("/")):
             raise TransportError(
-                f"{name!r:.220} is no name in ROS 1: words of letters, digits and '_', each "
+                f"{brief(name)} is no name in ROS 1: words of letters, digits and '_', each "
                 f"beginning with a letter, with '/' between them, {_MAX_NAME} characters at most"
             )
         return name if name.startswith("/") else self.namespace + name

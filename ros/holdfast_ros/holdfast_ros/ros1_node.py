@@ -17,6 +17,7 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from typing import Any, Final
 
 from holdfast.errors import DEFECT, TransportError, defect_fields
+from holdfast.printable import brief
 from holdfast.runtime.addresses import host_and_port, why_not_bound
 from holdfast_ros.messages import MAX_BYTES
 from holdfast_ros.ros1_environment import RosEnvironment, RosType
@@ -283,7 +284,7 @@ class RosNode:
                     return 0, "no protocol but TCPROS is spoken here", []
                 return _OK, "", ["TCPROS", self._environment.host, self._port]
             case _:
-                return _UNKNOWN, f"{method!r:.100} is no method of a node", 0
+                return _UNKNOWN, f"{brief(method)} is no method of a node", 0
 
     # -- services and topics -----------------------------------------------------------------------
 
@@ -331,7 +332,7 @@ class RosNode:
             fields = {"callerid": self.name, "type": type_.name, "md5sum": type_.digest, **more}
         else:
             reason = f"{what} is of type {type_.name} with MD5 {type_.digest}"
-            fields = {"error": f"{reason}; {digest!r:.60} was asked for"}
+            fields = {"error": f"{reason}; {brief(digest)} was asked for"}
         writer.write(encode_header(fields))
         return agreed
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from holdfast.config.reading import absolute_endpoint
 from holdfast.errors import InvalidValueError, TransportError
+from holdfast.printable import brief
 from holdfast.runtime.command_line import Options, flag, location, number, option, whole_number
 from holdfast.runtime.log_lines import LogFormat
 from holdfast.runtime.logs import log_option
@@ -35,10 +36,10 @@ def http_address(text: str) -> HttpAddress:
     try:
         host = parse_host(host) if colon else "127.0.0.1"
     except TransportError as error:
-        raise argparse.ArgumentTypeError(f"is {text!r:.80}: {error}") from None
+        raise argparse.ArgumentTypeError(f"is {brief(text)}: {error}") from None
     if not re.fullmatch("[0-9]{1,5}", port) or int(port) > 65535:
         raise argparse.ArgumentTypeError(
-            f"is {text!r:.80}: port {port!r:.80} is not a whole number from 0 to 65535"
+            f"is {brief(text)}: port {brief(port)} is not a whole number from 0 to 65535"
         )
     return HttpAddress(host, int(port))
 

@@ -20,6 +20,7 @@ from holdfast.config.source import SETTINGS
 from holdfast.config.yaml_document import read
 from holdfast.conversion import convert
 from holdfast.errors import ConfigurationError
+from holdfast.printable import brief
 from holdfast.validation import close_match, described, dotted, find_mismatch
 
 _SECTIONS_OF_PROBLEMS = ("model.", "state_space_planner.")
@@ -176,7 +177,7 @@ def _assigned(index: int, assignment: str) -> tuple[str, Any]:
     section, dot, name = key.strip().partition(".")
     if not (equals and dot and section and name and "." not in name and text.strip()):
         raise ConfigurationError(
-            f"assignments[{index}] is {assignment!r:.80}; expected SECTION.KEY=YAML, such as "
+            f"assignments[{index}] is {brief(assignment)}; expected SECTION.KEY=YAML, such as "
             "offload.tls=null"
         )
     return f"{section}.{name}", read(text.encode(), f"assignments[{index}]").data
