@@ -10,7 +10,7 @@ import pytest
 from tests.ports import free_port
 from tests.processes import faults
 from tests.processes.test_tls import secure
-from tests.wire import HELLO, RawLink, hello_of
+from tests.wire import GOODBYE, HELLO, RawLink, hello_of
 
 from holdfast.runtime.descriptors import NEEDED
 from holdfast.transport.service_end import MAX_LINKS, MAX_UNKNOWN
@@ -86,8 +86,10 @@ def test_one_certificate_does_not_take_them_all(site: faults.Site, keys: Path) -
         for _ in range(60):
             link = stack.enter_context(RawLink(cloud.endpoint, keys / "ours" / "greedy"))
             link.say(hello_of())
-            answers.append(frame.kind if (frame := link.receive()) else None)
-        assert answers.count(HELLO) == 25  # a quarter
+            answers.append(link.receive())
+        assert [each and each.kind for each in answers].count(HELLO) == 25  # a quarter
+        full = b"one too many: 25 robots are connected; with a higher limit on open files (ulimit"
+        assert any(each and each.kind == GOODBYE and full in each.payload for each in answers)
         other = stack.enter_context(RawLink(cloud.endpoint, keys / "ours" / "robot"))
         other.say(hello_of())
         frame = other.receive()

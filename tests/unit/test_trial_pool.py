@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import multiprocessing
 import os
+import resource
 import signal
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ import msgspec
 import pytest
 from tests.unit.test_trial import configuration_of, failing_configuration, one
 
-from holdfast.errors import InvalidValueError, TrialError, WorkerDiedError
+from holdfast.errors import DescriptorError, InvalidValueError, TrialError, WorkerDiedError
 from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.robot import trial_pool
@@ -53,6 +54,17 @@ def test_trials_of_several_arms(tmp_path: Path, jobs: int) -> None:
     assert sorted(found) == [(arm.label, trial) for arm in arms for trial in (0, 2)]
     assert found["as it is", 2].digest == one(configuration_of(tmp_path), 2).digest
     assert found["random", 2].digest != found["as it is", 2].digest
+
+
+def test_more_workers_than_files_may_be_open_are_not_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (66, 66))
+    with TrialPool(24, overdue=lambda *_: False) as pool:
+        pool.submit(arms_of(tmp_path)[0], 0)
+        with pytest.raises(DescriptorError, match=r"66 files.*needs 136.*or take fewer jobs"):
+            list(pool.run())
+        assert pool._workers == []
 
 
 def test_a_worker_builds_a_problem_once_and_tells_how_each_trial_went(tmp_path: Path) -> None:

@@ -53,6 +53,7 @@ from holdfast.printable import brief
 from holdfast.problems.problem import Problem
 from holdfast.robot.trial import NULL_OBSERVER, TrialObserver, run_trial
 from holdfast.runtime.command_line import MAX_JOBS
+from holdfast.runtime.descriptors import NEEDED, allow_descriptors
 from holdfast.runtime.machine import available_cores
 from holdfast.runtime.ray_workers import RayCluster, RayProcess
 from holdfast.runtime.workers import WorkerProcess, end_workers
@@ -62,6 +63,7 @@ _LOOKAHEAD_S = 0.1  # of trials that a worker is sent, so that it never waits fo
 _MAX_LOOKAHEAD = 16
 _TICK_S = 0.25  # between two looks at trials that may be overdue
 _BUILD_S = 60.0  # for a worker to start and to build a problem, before a trial's time begins
+_DESCRIPTORS = 3  # that a worker takes here: its pipe, and two of multiprocessing
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +243,10 @@ class TrialPool:
 
     def _start_workers(self) -> None:
         """Start workers one by one, each noted first, so that they can always be ended."""
-        self._wanted = self._wanted or min(self._jobs, self._remaining())
+        if not self._wanted:
+            self._wanted = min(self._jobs, self._remaining())
+            needed = NEEDED + _DESCRIPTORS * self._wanted
+            allow_descriptors(needed, needed, "; or take fewer jobs (--jobs)")
         threads = max(1, available_cores() // self._wanted) if self._cluster is None else 1
         limit = self._queue[0][0].planning.active_sensing.num_cores or threads
         while (number := len(self._workers)) < self._wanted:

@@ -14,11 +14,12 @@ NEEDED = 64
 """For any command. A robot was seen to have 21 open at a time, a service 9 without its robots."""
 
 
-def allow_descriptors(wanted: int = NEEDED) -> int:
+def allow_descriptors(wanted: int = NEEDED, needed: int = NEEDED, instead: str = "") -> int:
     """Raise the limit on open files and sockets to ``wanted``, as far as the hard limit allows.
 
     Returns how many may be open now; ``wanted`` if there is no limit. Raises DescriptorError if
-    fewer than :data:`NEEDED` are allowed; the message says how to raise the limit.
+    fewer than ``needed`` are allowed; the message says how to raise the limit, and what to do
+    ``instead``.
     """
     try:
         import resource
@@ -32,10 +33,10 @@ def allow_descriptors(wanted: int = NEEDED) -> int:
         with contextlib.suppress(OSError, ValueError):
             resource.setrlimit(resource.RLIMIT_NOFILE, (possible, hard))
             soft = possible
-    if soft != unlimited and soft < NEEDED:
+    if soft != unlimited and soft < needed:
         raise DescriptorError(
             f"this process may have {soft} files and sockets open at a time (RLIMIT_NOFILE), and "
-            f"needs {NEEDED}; raise the limit with 'ulimit -n {NEEDED}', for a service of systemd "
-            f"with LimitNOFILE={NEEDED}"
+            f"needs {needed}; raise the limit with 'ulimit -n {needed}', for a service of systemd "
+            f"with LimitNOFILE={needed}{instead}"
         )
     return wanted if soft == unlimited else soft

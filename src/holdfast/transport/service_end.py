@@ -340,7 +340,9 @@ class StreamServiceTransport(LinkOwner):
         if link.peer is not None and hello.name not in ("", link.peer.name):
             return f"says that it is {hello.name}, and shows the certificate of {link.peer.name}"
         if len(self._links) >= self._max_links and not self._make_room(_certified(link)):
-            return f"is one too many: {self._max_links} robots are connected"
+            limited = self._max_links < MAX_LINKS
+            more = "; with a higher limit on open files (ulimit -Hn) it takes more" * limited
+            return f"is one too many: {self._max_links} robots are connected{more}"
         return None
 
     def _make_room(self, name: str | None) -> bool:
