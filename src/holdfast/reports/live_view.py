@@ -80,6 +80,9 @@ class LiveView:
         self._waiting.join(_CLOSE_S)
         if self._waiting.is_alive():
             self._on_note(f"the view was not complete {_CLOSE_S:g} s after the run")
+            self._on_note = lambda _: None
+            self._worker.kill()  # not yet awaited here: of two threads one would find no child
+            self._waiting.join()
         end_workers([self._worker])
 
     def _report(self) -> FollowerReport:

@@ -39,9 +39,8 @@ _STARTED: weakref.WeakSet[WorkerProcess] = weakref.WeakSet()
 def _kill_remaining() -> None:
     """Kill workers at exit: they block the signal with which multiprocessing would end them."""
     for worker in list(_STARTED):
-        if worker._process.pid is not None:
-            with contextlib.suppress(ValueError):
-                worker._process.kill()
+        with contextlib.suppress(ValueError):
+            worker.kill()
 
 
 class WorkerProcess:
@@ -89,6 +88,11 @@ class WorkerProcess:
         except (EOFError, OSError):
             return None
 
+    def kill(self) -> None:
+        """End it at once, if it was started; it is not waited for."""
+        if self._process.pid is not None:
+            self._process.kill()
+
     def how_it_ended(self) -> tuple[str, bool]:
         """Return how it ended, as a part of a sentence, and whether a signal did it."""
         self._process.join(_END_S)
@@ -106,7 +110,7 @@ def end_workers(workers: Iterable[WorkerProcess]) -> None:
     started = [worker for worker in workers if worker._process.pid is not None]
     with _no_signals():
         for worker in started:
-            worker._process.kill()
+            worker.kill()
     for worker in started:
         worker._process.join()
     for worker in workers:
