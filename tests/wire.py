@@ -82,11 +82,7 @@ class RawLink:
     """A stream to an endpoint; nothing is said on it but what is asked for."""
 
     def __init__(
-        self,
-        endpoint: str | socket.socket,
-        keys: Path | None = None,
-        *,
-        shakes_hands: bool = True,
+        self, endpoint: str | socket.socket, keys: Path | None = None, *, shakes_hands: bool = True
     ) -> None:
         self._buffer = bytearray()
         self._has_magic = False
@@ -179,11 +175,7 @@ class RawClient(RawLink):
     """A robot's end that has greeted the service, and asks it one thing at a time."""
 
     def __init__(
-        self,
-        endpoint: str | socket.socket,
-        keys: Path | None = None,
-        *,
-        hello: bytes | None = None,
+        self, endpoint: str | socket.socket, keys: Path | None = None, *, hello: bytes | None = None
     ) -> None:
         super().__init__(endpoint, keys)
         try:

@@ -24,10 +24,7 @@ setup(
         (f"lib/{NAME}", ["scripts/node"]),
     ],
     entry_points={
-        "holdfast.commands": [
-            f"ros1-guard = {NAME}.ros1_guard",
-            f"ros1-serve = {NAME}.ros1_serve",
-        ]
+        "holdfast.commands": [f"ros1-guard = {NAME}.ros1_guard", f"ros1-serve = {NAME}.ros1_serve"]
     },
     zip_safe=False,
 )

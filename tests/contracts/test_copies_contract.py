@@ -119,11 +119,7 @@ OBJECTS: dict[str, Kept] = {
     ),
     "configuration": Kept(
         lambda: hf.load_configuration(EXAMPLES / "peg_in_hole_2d.yaml", overrides=SMALL),
-        lambda read: (
-            read.to_yaml(),
-            read.path,
-            ended(hf.Planner(read.problem, read.planning)),
-        ),
+        lambda read: (read.to_yaml(), read.path, ended(hf.Planner(read.problem, read.planning))),
     ),
     "world": Kept(moved_world, after),
     "world of another": Kept(

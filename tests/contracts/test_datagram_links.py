@@ -516,11 +516,7 @@ class TestWhatGoesTogether:
 
     @pytest.mark.parametrize("end", ["robot", "service"])
     def test_without_the_package_it_is_said_how_to_get_it(
-        self,
-        end: str,
-        robot_tls: TlsFiles,
-        service_tls: TlsFiles,
-        monkeypatch: pytest.MonkeyPatch,
+        self, end: str, robot_tls: TlsFiles, service_tls: TlsFiles, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setitem(sys.modules, "cryptography.hazmat.primitives.ciphers.aead", None)
         with pytest.raises(TransportError, match="pip install cryptography"):

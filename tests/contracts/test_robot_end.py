@@ -28,11 +28,7 @@ from tests.contracts.wires import (
 )
 from tests.process_states import stop
 
-from holdfast.protocol.robot_events import (
-    CallEnded,
-    ServiceAppeared,
-    ServiceVanished,
-)
+from holdfast.protocol.robot_events import CallEnded, ServiceAppeared, ServiceVanished
 from holdfast.transport import dialer as dialer_module
 from holdfast.transport import links
 from holdfast.transport.dialer import Dialer

@@ -41,9 +41,7 @@ LOOKING = [
         resolution=0.05,
     )
     for method, estimator, actions in itertools.product(
-        sorted(ENTROPY_METHODS),
-        get_args(Estimator),
-        ("commanded", "executed"),
+        sorted(ENTROPY_METHODS), get_args(Estimator), ("commanded", "executed")
     )
 ]
 LOOKING += [

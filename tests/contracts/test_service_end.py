@@ -10,11 +10,7 @@ from pathlib import Path
 import pytest
 from tests.contracts import wires
 
-from holdfast.protocol.robot_events import (
-    CallEnded,
-    ServiceAppeared,
-    ServiceVanished,
-)
+from holdfast.protocol.robot_events import CallEnded, ServiceAppeared, ServiceVanished
 from holdfast.transport import service_end
 from holdfast.transport.contract import IncomingCall
 from holdfast.transport.endpoints import TlsFiles

@@ -169,10 +169,7 @@ def test_the_cloud_is_killed_paused_cut_off_and_moved(site: Site, engine: Engine
     harm(lambda: docker("kill", cloud), heal=lambda: docker("start", cloud))
     harm(lambda: docker("pause", cloud), heal=lambda: docker("unpause", cloud))
     # Its loop stands still: it ends itself, and the engine starts it again with nobody there.
-    harm(
-        lambda: os.kill(site.state("cloud")["Pid"], signal.SIGUSR1),
-        heal=lambda: None,
-    )
+    harm(lambda: os.kill(site.state("cloud")["Pid"], signal.SIGUSR1), heal=lambda: None)
     assert engine.inspect(cloud)["RestartCount"] == 1
     harm(
         lambda: docker("network", "disconnect", site.name, cloud),

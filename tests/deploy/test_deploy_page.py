@@ -59,10 +59,7 @@ def test_ten_minutes(engine: Engine, images: Images, tmp_path: Path) -> None:
     }
     try:
         done = engine.run(
-            *("bash", "-c", PRELUDE + "".join(typed)),
-            variables=variables,
-            cwd=clone,
-            timeout=600,
+            *("bash", "-c", PRELUDE + "".join(typed)), variables=variables, cwd=clone, timeout=600
         )
         assert done.returncode == 0, done.stdout + done.stderr
     finally:

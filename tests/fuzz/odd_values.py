@@ -147,10 +147,7 @@ class OddValues:
         items = []
         for k in range(count):
             odd = self._chance.random() < 0.3
-            items += [
-                self.value(depth) if odd else b"\xa1" + bytes([97 + k]),
-                self.value(depth),
-            ]
+            items += [self.value(depth) if odd else b"\xa1" + bytes([97 + k]), self.value(depth)]
         return bytes([0x80 | count]) + b"".join(items)
 
 

@@ -61,11 +61,7 @@ class _ComeAndGo:
 
 
 def run_soak(
-    seconds: float,
-    seed: int,
-    *,
-    directory: Path,
-    tell: Callable[[str], None] = lambda _: None,
+    seconds: float, seed: int, *, directory: Path, tell: Callable[[str], None] = lambda _: None
 ) -> tuple[dict[str, Any], list[str]]:
     """Let sessions come and go for so long; return the figures, and what was found."""
     findings: list[str] = []
@@ -132,7 +128,7 @@ def run_soak(
                     event["event"] == "status" and event["to"] == "local_recovery"
                     for event in events
                 ),
-            },
+            }
         }
     return figures, findings
 

@@ -25,11 +25,7 @@ from tests.fuzz.attack_messages import hostile_settings, nearly_right, odd_reque
 from tests.fuzz.targets import SPECIMENS
 from tests.unit.test_protocol_service import Bench, Robot, content, planning_of
 
-from holdfast.protocol.messages import (
-    Request,
-    encode,
-    with_checksum,
-)
+from holdfast.protocol.messages import Request, encode, with_checksum
 from holdfast.protocol.request_queue import RequestQueue
 from holdfast.protocol.service_sessions import BRIEF, FIRST, LONG, MEDIUM, NEW, PendingTask, Session
 
@@ -277,8 +273,6 @@ def test_hostile_robots_break_no_limit_and_disturb_nobody(runs: int, steps: int)
     run_state_machine_as_test(
         HostileRobots,
         settings=settings(
-            max_examples=runs,
-            stateful_step_count=steps,
-            suppress_health_check=list(HealthCheck),
+            max_examples=runs, stateful_step_count=steps, suppress_health_check=list(HealthCheck)
         ),
     )

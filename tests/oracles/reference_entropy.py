@@ -92,11 +92,7 @@ def nearest_neighbor_entropy(
 
 
 def prior_neighbors_entropy(
-    points: FloatArray,
-    weights: FloatArray,
-    prior: FloatArray,
-    neighbors: int,
-    resolution: float,
+    points: FloatArray, weights: FloatArray, prior: FloatArray, neighbors: int, resolution: float
 ) -> float:
     weights = np.where(significant(weights), weights, 0.0)
     weights = weights / weights.sum()

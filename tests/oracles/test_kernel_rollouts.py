@@ -11,11 +11,7 @@ from holdfast import _kernel
 from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.randomness import Purpose, Stream, stream
 from holdfast.planning.expected_return import rollout_returns
-from holdfast.planning.settings import (
-    ActiveSensingSettings,
-    PlanningSettings,
-    SelectorSettings,
-)
+from holdfast.planning.settings import ActiveSensingSettings, PlanningSettings, SelectorSettings
 from holdfast.problems.attributes import has_own, sensing_costs
 from holdfast.problems.capsule_robot import CapsuleRobot, CapsuleRobotModel
 from holdfast.problems.multitier_peg_in_hole_2d import (

@@ -73,10 +73,7 @@ def emulated(row: PublishedRow, num_trials: int) -> pd.DataFrame:
 
 
 def success_p_value(successes: int, num_trials: int, row: PublishedRow) -> float:
-    table = [
-        [successes, num_trials - successes],
-        [row.successes, row.num_trials - row.successes],
-    ]
+    table = [[successes, num_trials - successes], [row.successes, row.num_trials - row.successes]]
     return float(stats.fisher_exact(table).pvalue)
 
 

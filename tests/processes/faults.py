@@ -44,11 +44,7 @@ PROBLEMS = tuple(BUILT_IN)
 STANDARD, LOCAL_RECOVERY, KEEP_ALIVE = "standard", "local_recovery", "keep_alive"
 RECOVERY = "cloud_active_sensing_recovery"
 
-PATIENT = {
-    "detection_timeout_ms": 30_000.0,
-    "lease_ms": 30_000.0,
-    "startup_timeout_ms": 30_000.0,
-}
+PATIENT = {"detection_timeout_ms": 30_000.0, "lease_ms": 30_000.0, "startup_timeout_ms": 30_000.0}
 """What is dead is still found by its broken link, and what is only slow is never taken for dead."""
 
 QUICK = {"detection_timeout_ms": 1500.0, "lease_ms": 4000.0}

@@ -116,9 +116,7 @@ class TestTakenAwayInMidRun:
         """Its own problem takes the files away, in its last trial."""
         (site.directory / "thief.py").write_text(THIEF)
         out = site.directory / "out"
-        file = site.configure(
-            {**document_of(PEG, max_steps=6, trials=3), "problem": "thief:Thief"},
-        )
+        file = site.configure({**document_of(PEG, max_steps=6, trials=3), "problem": "thief:Thief"})
         variables = {"THIEF_TAKES": str(out if take is shutil.rmtree else out / "journal.bin")}
         batch = site.process(
             *COMMAND, "run", str(file), "--out", str(out), "--jobs", "1", variables=variables
@@ -172,9 +170,7 @@ class TestCutOffAfterAKill:
 class TestCannotBeWritten:
     @needs_mounts
     @pytest.mark.parametrize(
-        "killed",
-        [True, pytest.param(False, marks=pytest.mark.slow)],
-        ids=["killed", "ended"],
+        "killed", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["killed", "ended"]
     )
     def test_a_read_only_file_system(
         self, killed: bool, site: Site, references: References

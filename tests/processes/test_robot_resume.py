@@ -192,9 +192,7 @@ class TestEndedInOrder:
 
         story.at("perform", 20, story.status(LOCAL_RECOVERY), end)
         robot = site.run(
-            story.file,
-            services=[cloud],
-            command=[*COMMAND[:2], opens_terminal + COMMAND[2]],
+            story.file, services=[cloud], command=[*COMMAND[:2], opens_terminal + COMMAND[2]]
         )
         os.close(theirs)
         assert robot.wait() == 128 + number

@@ -56,8 +56,7 @@ def test_an_action_beyond_the_limits_is_not_performed(
 
 
 @pytest.mark.parametrize(
-    ("what", "kind"),
-    [("half", "task"), pytest.param("sensing", "sensing", marks=pytest.mark.slow)],
+    ("what", "kind"), [("half", "task"), pytest.param("sensing", "sensing", marks=pytest.mark.slow)]
 )
 def test_a_lie_within_the_limits_is_found_among_the_answers_computed_again(
     what: str, kind: str, site: faults.Site

@@ -341,7 +341,7 @@ class TestTheMasterDies:
         around.master.wait()
         around.start(
             # The system's Python, as the robot has it.
-            *(around.python, "-m", "holdfast", "ros1-serve", "--configuration", str(EXAMPLE)),
+            *(around.python, "-m", "holdfast", "ros1-serve", "--configuration", str(EXAMPLE))
         )
         around.start_master()
         wait_for(lambda: around.service_uri(CLOUD), "the service is listed")

@@ -65,12 +65,7 @@ _defect(
     "late_not_kept",
     "Of a late observation only the state is kept: when another one comes that belongs before it, "
     "it is not folded again.",
-    Edit(
-        Trial,
-        "_take_late",
-        "self._inputs[position] = sensed, None",
-        "pass",
-    ),
+    Edit(Trial, "_take_late", "self._inputs[position] = sensed, None", "pass"),
 )
 _defect(
     "states_before_not_renewed",
@@ -115,12 +110,7 @@ _defect(
     "last_move_not_used",
     "The environment tells again what the last move before a crash has shown; the robot takes the "
     "model's move.",
-    Edit(
-        Robot,
-        "_settle_pending_action",
-        "begun.last or Moved(known, None)",
-        "Moved(known, None)",
-    ),
+    Edit(Robot, "_settle_pending_action", "begun.last or Moved(known, None)", "Moved(known, None)"),
 )
 _defect(
     "move_not_written",

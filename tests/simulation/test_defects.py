@@ -70,16 +70,8 @@ FOUND_AT_ONCE = [
         "kill_robot at=0.3 down_s=0.05",
         "comes before the action of that step is known to be performed",
     ),
-    (
-        "stale_answer_used",
-        "run trial=1\nlate step=9 moves=3",
-        "the undisturbed run has",
-    ),
-    (
-        "motion_not_told",
-        "run moves_show=true",
-        "comes to another state",
-    ),
+    ("stale_answer_used", "run trial=1\nlate step=9 moves=3", "the undisturbed run has"),
+    ("motion_not_told", "run moves_show=true", "comes to another state"),
 ]
 
 

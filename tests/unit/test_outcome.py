@@ -12,12 +12,7 @@ from tests.recordings import failed, result_of
 
 from holdfast.errors import InvalidValueError
 from holdfast.planning.inputs import ActingRecord, Sensed, encode_floats
-from holdfast.planning.outcome import (
-    TRIAL_COLUMNS,
-    DecisionLog,
-    Decisions,
-    RewardAccount,
-)
+from holdfast.planning.outcome import TRIAL_COLUMNS, DecisionLog, Decisions, RewardAccount
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
 DIGEST = bytes(range(32))

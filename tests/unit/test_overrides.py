@@ -18,10 +18,7 @@ from holdfast.config.source import SETTINGS
 from holdfast.errors import ConfigurationError, HoldfastError
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
-SECTIONS: dict[str, type[msgspec.Struct]] = {
-    **SETTINGS,
-    **schemas_of(PegInHole2D),
-}
+SECTIONS: dict[str, type[msgspec.Struct]] = {**SETTINGS, **schemas_of(PegInHole2D)}
 KEYS = [
     (section, field.encode_name)
     for section, schema in SECTIONS.items()

@@ -17,12 +17,7 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.randomness import Stream
 from holdfast.planning import planner as planning
 from holdfast.planning.belief import Belief
-from holdfast.planning.planner import (
-    Planner,
-    decode_checkpoint,
-    digest,
-    encode_checkpoint,
-)
+from holdfast.planning.planner import Planner, decode_checkpoint, digest, encode_checkpoint
 from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,

@@ -213,8 +213,7 @@ class TestMisspelt:
 
     def test_one_of_a_pair(self) -> None:
         broken = self.of(
-            log_likelyhood=lambda *_: 0.0,
-            sample_observation=lambda *arguments: arguments[1],
+            log_likelyhood=lambda *_: 0.0, sample_observation=lambda *arguments: arguments[1]
         )
         with pytest.raises(ProblemError, match="go together; it has log_likelyhood: did you mean"):
             check_problem(broken)

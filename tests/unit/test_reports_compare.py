@@ -83,8 +83,7 @@ def run_of(
             journal.add(result)
         if unfinished is not None:
             journal.append(
-                unfinished,
-                [Sensed(0, 1, b"\0" * 8, b"\0" * 32, 0.5), ActingRecord(0, action)],
+                unfinished, [Sensed(0, 1, b"\0" * 8, b"\0" * 32, 0.5), ActingRecord(0, action)]
             )
     return directory
 

@@ -137,9 +137,7 @@ def test_the_last_of_two_new_addresses_is_the_one_that_can_be_proved() -> None:
         max_size=60,
     )
 )
-def test_no_address_is_used_that_has_not_echoed(
-    steps: list[tuple[Any, float, bool, bool]],
-) -> None:
+def test_no_address_is_used_that_has_not_echoed(steps: list[tuple[Any, float, bool, bool]]) -> None:
     path, now, sent, known = ReturnPath(), 0.0, list[Probe](), set[Any]()
     for address, wait_s, newest, echoes in steps:
         now += wait_s

@@ -223,8 +223,7 @@ def test_what_comes_while_all_is_closed_ends_nothing_too_early(robots: Robots) -
 
 def test_an_earlier_time_replaces_a_later_one(robots: Robots) -> None:
     robot, machine = scripted(
-        robots,
-        lambda: robot._on_loop().call_later(0.001, robot._happens, RecoveryExited(1, "")),
+        robots, lambda: robot._on_loop().call_later(0.001, robot._happens, RecoveryExited(1, ""))
     )
     machine.wakeups = [time.monotonic() + 10.0 * PATIENCE_S]
 
@@ -374,8 +373,7 @@ class TestSignals:
 
     def test_it_wakes_a_loop_that_sleeps(self, robots: Robots) -> None:
         robot, _ = scripted(
-            robots,
-            lambda: threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start(),
+            robots, lambda: threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
         )
         with pytest.raises(KeyboardInterrupt):
             robot.run(())

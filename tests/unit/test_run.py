@@ -346,10 +346,7 @@ def test_what_is_not_there_claims_no_directory(
     [
         (["run", "missing.yaml"], "missing.yaml: there is no such file"),
         (["run", "peg.yaml", "--trials", "x"], "--trials is 'x'; allowed are"),
-        (
-            ["run", "peg.yaml", "--recovery", "sometimes"],
-            "recovery.launch, given instead of",
-        ),
+        (["run", "peg.yaml", "--recovery", "sometimes"], "recovery.launch, given instead of"),
         (["run", "peg.yaml"], "--log json needs --service, --environment or --rate"),
         (["serve", "--listen", "tcp/nowhere"], "--listen: endpoint 'tcp/nowhere'"),
         (["serve", "--lease-ms", "1"], "--lease-ms is '1'; allowed are numbers from 50"),

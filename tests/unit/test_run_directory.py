@@ -120,10 +120,7 @@ class TestRunDirectory:
         other = configuration_of(tmp_path, seed=6)
         with RunDirectory.create(out, other) as directory:
             assert directory.earlier_wall_time_s == 0.0
-            assert {path.name for path in out.iterdir()} == {
-                "config.yaml",
-                "journal.bin",
-            }
+            assert {path.name for path in out.iterdir()} == {"config.yaml", "journal.bin"}
             with pytest.raises(OutputError, match="holds config"):
                 RunDirectory.create(out, other)  # in use by the run above
             directory.add(result_of(0))

@@ -33,12 +33,7 @@ from holdfast.protocol.messages import (
     encode,
     with_checksum,
 )
-from holdfast.protocol.robot_events import (
-    CallEnded,
-    ReplyReceived,
-    ServiceAppeared,
-    TransportEvent,
-)
+from holdfast.protocol.robot_events import CallEnded, ReplyReceived, ServiceAppeared, TransportEvent
 from holdfast.protocol.service import Service
 from holdfast.protocol.service_jobs import (
     EndCall,
@@ -284,8 +279,7 @@ def let_go(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
 
 @pytest.mark.parametrize(
-    ("bound", "value"),
-    [("_MAX_UNDECODED", 2), ("_MAX_UNDECODED_BYTES", int(2.5 * len(LARGE)))],
+    ("bound", "value"), [("_MAX_UNDECODED", 2), ("_MAX_UNDECODED_BYTES", int(2.5 * len(LARGE)))]
 )
 async def test_large_requests_beyond_the_bound_are_turned_away_unread(
     bound: str, value: int, let_go: threading.Event, monkeypatch: pytest.MonkeyPatch

@@ -73,11 +73,7 @@ def test_events_in_order_without_the_damaged_ones(tmp_path: Path) -> None:
         {"time": "2023-11-14T22:13:20Z", "event": "status", "status": "standard"},
         {"time": "yesterday", "event": "status"},
     ]
-    path.write_text(
-        "\n".join(
-            [*map(json.dumps, lines), '{"time": "2023'],
-        )
-    )
+    path.write_text("\n".join([*map(json.dumps, lines), '{"time": "2023']))
     events = read_events(path)
     assert [event.name for event in dated(events, RunClock([]))] == ["status", "trial"]
     assert trial_ends(events) == {0: 1_700_000_001 * NS_PER_S}

@@ -40,10 +40,10 @@ class CompareOptions(Options):
     )
     outcomes: bool = flag(
         help="Show which run is better: success, steps, rewards and decision times against the "
-        "first run's, with intervals.",
+        "first run's, with intervals."
     )
     unpaired: bool = flag(
-        help="With --outcomes: take the runs as independent samples, as of other seeds.",
+        help="With --outcomes: take the runs as independent samples, as of other seeds."
     )
     json: bool = flag(help="Print the finding as a JSON object.")
 

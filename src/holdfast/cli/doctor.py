@@ -48,9 +48,7 @@ class DoctorOptions(Options):
         help="The service (tls/cloud.example.org:7447), instead of CONFIG's.",
     )
     tls: Path | None = option(
-        metavar="DIR",
-        read=location,
-        help="This robot's credentials, instead of CONFIG's.",
+        metavar="DIR", read=location, help="This robot's credentials, instead of CONFIG's."
     )
     json: bool = flag(help="Print each finding as a JSON object, one a line.")
 

@@ -66,9 +66,7 @@ class KeysOptions(Options):
     renew: bool = flag(help="New certificates for existing keys.")
     rotate: bool = flag(help="New keys and certificates for those that have some.")
     revoke: tuple[str, ...] = option(
-        metavar="NAME",
-        many=True,
-        help="A robot or service whose certificates are no longer valid.",
+        metavar="NAME", many=True, help="A robot or service whose certificates are no longer valid."
     )
     revoke_serial: tuple[int, ...] = option(
         metavar="HEX",

@@ -21,16 +21,11 @@ def follow_imports(
 
     The sources are read, not run, so what is imported under a name made at run time is not found.
 
-    Parameters
-    ----------
-    locate : callable
-        Returns the source of a module, None for one that is not to be followed, and for a name that
-        is no module.
-    loaded : callable or None
-        Is asked as well where ``locate`` has none, but only for what a module imports while it is
-        itself imported: in each process that has loaded the one, the other is loaded, too.
-    places : bool
-        Whether what a string names as ``module:attribute``, as registries do, counts as imported.
+    ``locate`` returns the source of a module, None for one that is not to be followed, and for a
+    name that is no module. ``loaded`` is asked as well where that has none, but only for what a
+    module imports while it is itself imported: in each process that has loaded the one, the other
+    is loaded, too. With ``places``, what a string names as ``module:attribute``, as registries do,
+    counts as imported.
     """
     found: dict[str, Path] = {}
     waiting = [(name, False) for name in modules]

@@ -147,19 +147,11 @@ def find_class(
 ) -> type[Any]:
     """Find a class by its name.
 
+    That is the name of an entry point of the ``group``, or ``module:Class``, and the module is
+    looked for in ``search_directory`` first (:mod:`holdfast.config.user_modules`). Messages begin
+    with ``what`` it is for, usually the key of the configuration, and suggest ``built_in``, too.
     Raises ``error_type`` if the name is not registered, or the module or its class cannot be
     imported, whatever its import raises.
-
-    Parameters
-    ----------
-    name : str
-        Of an entry point of the ``group``, or ``module:Class``.
-    what : str
-        What it is for, usually the key of the configuration; messages begin with it.
-    search_directory : Path or None
-        Directory in which ``module`` is looked for first (:mod:`holdfast.config.user_modules`).
-    built_in : iterable of str
-        Further names that messages suggest.
     """
     try:
         if ":" in name:

@@ -198,14 +198,9 @@ class Journal(JournalReader):
         are on the disk. The first records of a trial, and the first after each opening, always are:
         so it is always known that a trial was begun.
 
-        Raises
-        ------
-        OutputError
-            If they cannot be written. Then all of them are in the journal, or none.
-        LostJournalError
-            If the file was removed.
-        InvalidValueError
-            If the trial is finished already, or another one is unfinished.
+        Raises OutputError if they cannot be written, and then all of them are in the journal, or
+        none; LostJournalError if the file was removed; InvalidValueError if the trial is finished
+        already, or another one is unfinished.
         """
         if not records:
             return

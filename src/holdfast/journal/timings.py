@@ -69,13 +69,7 @@ class EventTable:
         return OutputError(f"{self._path}: cannot be written: {error.strerror}")
 
     def close(self) -> None:
-        """Close the file.
-
-        Raises
-        ------
-        OutputError
-            If what an unwritable disk has left in its buffer cannot be written now, either.
-        """
+        """Close the file; OutputError if what a full disk has left over cannot be written now."""
         try:
             self._file.close()
         except OSError as error:

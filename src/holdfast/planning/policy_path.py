@@ -49,12 +49,8 @@ def path_points(
     the motion without noise, and the next stage. All particles begin in one stage. Of the settings,
     ``selector.path_offsets``, ``path_unit``, ``path_discount`` and ``actions`` count.
 
-    Raises
-    ------
-    InvalidValueError
-        If the offsets do not increase, reach too far, or the horizon is above 1.
-    ProblemError
-        If a function of the problem breaks its contract.
+    Raises InvalidValueError if the offsets do not increase, reach too far, or the horizon is above
+    1; ProblemError if a function of the problem breaks its contract.
     """
     if (unfit := unfit_for_the_method(settings)) is not None:
         (section, key), reason = unfit

@@ -107,10 +107,7 @@ class RigidBodyProblem(KeepsReadOnly, ProblemBase):
     ) -> Self:
         """Build the problem from plain data; ``msgspec.ValidationError`` if it does not fit."""
         make: Callable[..., Self] = cls
-        return make(
-            convert(model, cls.Model),
-            convert(state_space_planner, cls.StateSpacePlanner),
-        )
+        return make(convert(model, cls.Model), convert(state_space_planner, cls.StateSpacePlanner))
 
     def __init__(
         self, model: Any, state_space_planner: Any, world: DiscWorld | RectangleWorld | BoxWorld

@@ -208,11 +208,8 @@ def compare_outcomes(runs: Sequence[Path], *, paired: bool = True) -> OutcomeCom
 
     Unless ``paired``, each is a sample of its own, so that runs with other seeds can be compared.
 
-    Raises
-    ------
-    OutputError
-        If one is no run or is damaged, or if the runs cannot be compared: their problems,
-        limits or (if paired) seeds differ, or they have too few trials.
+    Raises OutputError if one is no run or is damaged, or if the runs cannot be compared: their
+    problems, limits or (if paired) seeds differ, or they have too few trials.
     """
     found = [read_outcomes(path, str(path)) for path in runs]
     return compare_results(found, paired=paired, strict=True)

@@ -42,12 +42,7 @@ class Recorder(TrialObserver):
     """An observer that records one trial and ignores all others.
 
     A planner says what is estimated, and its problem which coordinates are angles; without one the
-    estimate is the mean.
-
-    Attributes
-    ----------
-    record : TrialRecord
-        Complete when ``record.result`` is not None.
+    estimate is the mean. ``record`` is complete when ``record.result`` is not None.
     """
 
     def __init__(self, trial: int, planner: Planner | None = None) -> None:

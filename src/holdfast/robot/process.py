@@ -502,10 +502,6 @@ class RobotProcess:
         self._replayed = None
         self._starting = (trial, history, tail_is_certain)
         self._runner = make_runner(
-            self._maker,
-            trial,
-            self._happens,
-            resumed=history.begun,
-            performed=history.actions,
+            self._maker, trial, self._happens, resumed=history.begun, performed=history.actions
         )
         self._runner.begin(history.state.step)

@@ -112,21 +112,13 @@ class FinishedTrial(NamedTuple):
 class TrialPool:
     """Runs trials in this process or in workers; the module says how to use it.
 
-    Parameters
-    ----------
-    jobs : int
-        Largest number of processes; 1 runs all trials in this one. Changes time only.
-    expected : int, optional
-        How many trials there will be, as far as known: for so few and short ones that workers would
-        not pay, none is started. None: workers are started for the first one.
-    observer : TrialObserver
-        Observes the trials that are run in this process because no worker could help: all of them
-        if ``jobs`` is 1, else the last one at most.
-    overdue : callable, optional
-        Asked of each trial that runs, with its arm and the seconds so far: whether its worker is to
-        be ended. If it is given, no trial is run in this process, which none can end or hold up.
-    cluster : RayCluster, optional
-        Where the workers are, in place of this machine; it takes ``overdue``.
+    There are at most ``jobs`` processes; 1 runs all trials in this one. Of ``expected`` trials, as
+    far as known, so few and short ones that workers would not pay start none; None starts them for
+    the first one. ``observer`` observes the trials that are run in this process because no worker
+    could help: all of them if ``jobs`` is 1, else the last one at most. ``overdue`` is asked of
+    each trial that runs, with its arm and the seconds so far, whether its worker is to be ended;
+    with it no trial is run in this process, which none can end or hold up. The workers may be on a
+    ``cluster`` in place of this machine, with ``overdue``.
     """
 
     def __init__(

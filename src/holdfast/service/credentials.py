@@ -56,10 +56,7 @@ class ServiceCredentials:
         return self._gone
 
     def watch(
-        self,
-        loop: asyncio.AbstractEventLoop,
-        transport: StreamServiceTransport,
-        events: EventSink,
+        self, loop: asyncio.AbstractEventLoop, transport: StreamServiceTransport, events: EventSink
     ) -> None:
         """Check the files from now on."""
         seen = self.files.versions()

@@ -113,11 +113,7 @@ def service_exposition(
 
 
 def _families(name: str, report: ServiceReport, is_ready: bool) -> Iterator[Metric]:
-    from prometheus_client.core import (
-        CounterMetricFamily,
-        GaugeMetricFamily,
-        HistogramMetricFamily,
-    )
+    from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 
     now, times = report.statistics, report.times
     build = GaugeMetricFamily(

@@ -68,7 +68,7 @@ class ServeOptions(Options):
     )
     insecure: bool = flag(
         help="Allow an address that other machines can reach without --tls: any of them can then "
-        "use the service and read along.",
+        "use the service and read along."
     )
     processes: int = option(
         read=whole_number(1, 256),
@@ -148,7 +148,7 @@ class ServeOptions(Options):
     )
     until_stdin_closes: bool = flag(
         help="Stop when standard input ends, as it does when the process that started this one "
-        "dies.",
+        "dies."
     )
     # For a process that a robot launches: the descriptor of the connection to it.
     robot: int | None = option(metavar="N", read=int, help="", hidden=True)

@@ -533,6 +533,10 @@ def _warn(options: ServeOptions, text: str) -> None:
 
 
 def _say_ready(options: ServeOptions, where: Mapping[str, object]) -> None:
+    from holdfast.transport.endpoints import REVOKED_FILE
+
+    if options.tls is not None and not (revoked := options.tls / REVOKED_FILE).exists():
+        where = {**where, "revokes_nobody_without": str(revoked)}
     if options.log == "json":
         from holdfast.runtime.logs import EventLog
 
@@ -547,6 +551,8 @@ def _say_ready(options: ServeOptions, where: Mapping[str, object]) -> None:
         parts.append("decides for the robot that has launched it")
     if "processes" in where:
         parts[-1] += f" with {where['processes']} processes"
+    if "revokes_nobody_without" in where:
+        parts.append(f"revokes nobody without {where['revokes_nobody_without']}")
     parts += [f"offers {what} at {where[what]}" for what in _OFFERED if what in where]
     # A closed standard output is no reason not to serve.
     with contextlib.suppress(OSError, ValueError):

@@ -111,10 +111,7 @@ class Authority(NamedTuple):
         return builder.sign(self.key, hashes.SHA256())
 
     def revoke(
-        self,
-        before: x509.CertificateRevocationList | None,
-        serials: Iterable[int],
-        now: datetime,
+        self, before: x509.CertificateRevocationList | None, serials: Iterable[int], now: datetime
     ) -> bytes:
         """Return the next list in PEM: the entries of before, and these numbers as of now."""
         number = 1
