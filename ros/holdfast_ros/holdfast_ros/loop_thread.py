@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import threading
 from collections.abc import Callable, Coroutine
-from concurrent.futures import CancelledError, Future, InvalidStateError
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from typing import Any, TypeVar
 
 from holdfast.errors import TransportError
@@ -19,7 +19,7 @@ class LoopThread:
 
     def __init__(self, name: str) -> None:
         self._loop = asyncio.new_event_loop()
-        self._awaited: set[Future[Any]] = set()
+        self._ended: Future[None] = Future()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -33,17 +33,16 @@ class LoopThread:
         except RuntimeError:
             coroutine.close()
             raise TransportError("it is closed") from None
-        self._awaited.add(future)
-        self._end_what_is_lost()
         try:
-            return future.result(within_s)
+            wait((future, self._ended), within_s, FIRST_COMPLETED)  # a closing loop runs none
+            return future.result(0.0)
         except TimeoutError:
-            raise TransportError(f"it took longer than {within_s:g} s") from None
+            text = "it is closed" if self._ended.done() else f"it took longer than {within_s:g} s"
+            raise TransportError(text) from None
         except CancelledError:
             raise TransportError("it is closed") from None
         finally:
-            self._awaited.discard(future)
-            future.cancel()
+            self.call(future.cancel)
 
     def call(self, function: Callable[..., object], *arguments: object) -> None:
         """Call a function there; after the end nothing happens."""
@@ -58,10 +57,4 @@ class LoopThread:
     def _run(self) -> None:
         with asyncio.Runner(loop_factory=lambda: self._loop) as runner:  # its end cancels all tasks
             runner.get_loop().run_forever()
-        self._end_what_is_lost()
-
-    def _end_what_is_lost(self) -> None:
-        """End the waits for what was to run while the loop closed, once it is closed."""
-        for future in tuple(self._awaited) if self._loop.is_closed() else ():
-            with contextlib.suppress(InvalidStateError):
-                future.set_exception(TransportError("it is closed"))
+        self._ended.set_result(None)

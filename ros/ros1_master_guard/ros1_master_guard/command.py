@@ -62,10 +62,7 @@ def _parser(program: str) -> argparse.ArgumentParser:
     add("--rosout", action=argparse.BooleanOptionalAction, default=True, help=text)
     text = "ROS's Python, which has rosmaster (default: /usr/bin/python3)"
     add("--python", metavar="FILE", default="/usr/bin/python3", help=text)
-    text = (
-        "where the master's registrations are written (default: a directory of this user that is "
-        "gone after a restart of the machine)"
-    )
+    text = "where registrations are written (default: a directory that a reboot removes)"
     add("--directory", metavar="DIR", type=_directory, help=text)
     text = "form of the ready line and of the log on standard error (default: text)"
     add("--log", choices=("text", "json"), default="text", help=text)

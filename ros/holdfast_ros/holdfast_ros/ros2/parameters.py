@@ -18,7 +18,6 @@ import msgspec.inspect
 from holdfast.config.loader import Configuration, load
 from holdfast.config.source import SETTINGS
 from holdfast.config.yaml_document import read
-from holdfast.conversion import convert
 from holdfast.errors import ConfigurationError
 from holdfast.printable import brief
 from holdfast.validation import close_match, described, dotted, find_mismatch
@@ -136,7 +135,7 @@ def read_parameters(values: Mapping[str, Any]) -> NodeParameters:
     of_own = {name: given[name] for name in OWN if name in given}
     if mismatch := find_mismatch(of_own, OwnParameters):
         raise ConfigurationError(f"{dotted(mismatch.path)} {mismatch.in_words()}")
-    own = convert(of_own, OwnParameters)
+    own = msgspec.convert(of_own, OwnParameters)  # noqa: TID251 - as the node begins
     overrides: dict[str, Any] = {}
     for name, value in given.items():
         if name in OWN or name in _OF_ROS or name.startswith(_OF_ROS_SECTIONS):
