@@ -18,7 +18,7 @@ def whole():
     return int
 
 def use():
-    made.append(convert({"inner": {"number": 2}, "flag": True}, Outer))
+    made.append(convert({"inner": {"number": 2}}, Outer))
     other.set()
 
 class Inner(msgspec.Struct):
@@ -26,9 +26,8 @@ class Inner(msgspec.Struct):
 
 class Outer(msgspec.Struct):
     inner: Inner
-    flag: bool
 
-made.append(convert({"inner": {"number": "1"}, "flag": 0}, Outer, strict=False))
+made.append(convert({"inner": {"number": "1"}}, Outer, strict=False))
 assert other.wait(60.0)
 print(*sorted(map(str, made)))
 """
@@ -36,6 +35,4 @@ print(*sorted(map(str, made)))
 
 def test_a_struct_that_one_thread_inspects_is_used_by_another_afterwards() -> None:
     # In a process of its own: what goes wrong here ends it.
-    assert said_by(_PROGRAM) == (
-        "Outer(inner=Inner(number=1), flag=False) Outer(inner=Inner(number=2), flag=True)\n"
-    )
+    assert said_by(_PROGRAM) == "Outer(inner=Inner(number=1)) Outer(inner=Inner(number=2))\n"

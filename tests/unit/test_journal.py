@@ -370,7 +370,7 @@ class TestDamage:
                 finished = {result.trial for result in journal.results(with_decisions=True)}
         except OutputError as error:
             assert str(error).startswith(f"{path}: ")
-            assert "another directory" in str(error)
+            assert read or "another directory" in str(error)
             return str(error)
         assert finished == {0, 1, 2}
         return unfinished.records
@@ -416,6 +416,16 @@ class TestDamage:
             with Journal.open(path) as journal:
                 journal.append(TRIAL, records_of(5))
             assert unfinished_of(path).records[-3:] == records_of(5)
+
+    def test_what_cannot_be_opened_to_the_end_is_not_kept_open(
+        self, path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        Journal.create(path, {}).close()
+        path.write_bytes(path.read_bytes() + b"half a frame")
+        with monkeypatch.context() as patch, pytest.raises(OutputError, match="written: Bad file"):
+            patch.setattr(os, "ftruncate", lambda *_: os.fstat(-1))
+            Journal.open(path)
+        Journal.open(path).close()  # nobody uses it
 
     def test_frames_are_of_one_file_and_in_their_order(self, killed: bytes, path: Path) -> None:
         with Journal.create(path, {}) as journal:

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from tests.unit.test_key_ring import contents_of, run_keys
 
 from holdfast.errors import CredentialsError, TransportError
+from holdfast.transport import revocation
 from holdfast.transport.credentials import load_credentials
 from holdfast.transport.endpoints import REVOKED_FILE, Role
 from holdfast.transport.key_ring import list_credentials, make_credentials, revoke_credentials
@@ -329,6 +330,14 @@ class TestReading:
             path.write_bytes(pem_of(der))
             with pytest.raises(TransportError, match=f"is a malformed revocation list: {says}"):
                 revoked_serials(path)
+
+    def test_the_size_of_a_list_is_bounded(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (path := tmp_path / REVOKED_FILE).write_bytes(pem := pem_of(SPECIMEN))
+        monkeypatch.setattr(revocation, "_MAX_LIST_BYTES", len(pem) - 1)
+        with pytest.raises(TransportError, match=f"is larger than {len(pem) - 1} bytes"):
+            revoked_serials(path)
 
     def test_no_file_is_an_empty_list(self, tmp_path: Path) -> None:
         assert revoked_serials(tmp_path / REVOKED_FILE) == frozenset()

@@ -16,6 +16,8 @@ import pytest
 from tests.unit.test_runtime_events import RecordingSink
 
 from holdfast.service.credentials import ServiceCredentials
+from holdfast.service.options import ServeOptions
+from holdfast.service.process import _say_ready
 from holdfast.transport.key_ring import make_credentials, revoke_credentials
 from holdfast.transport.service_end import StreamServiceTransport
 
@@ -181,6 +183,19 @@ def test_a_list_that_became_shorter_lets_nobody_in_again(service: Service, left:
     assert service.events.names() == ["credentials_reloaded", "credentials"]
     assert service.transport.num_revoked == 2
     assert service.credentials.is_stale
+
+
+def test_a_service_without_a_list_says_so_as_it_begins(
+    service: Service, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--log", "json", "--tls", str(service.own)]
+    for each in (words, words[2:]):
+        _say_ready(ServeOptions.parse("serve", each), {"listen": ["tls/h:1"]})
+    for line in capsys.readouterr().out.splitlines():
+        assert "revokes" in line and str(service.own / "revoked.pem") in line
+    revoke_credentials(service.home, serials=[7])
+    _say_ready(ServeOptions.parse("serve", words), {"listen": ["tls/h:1"]})
+    assert "revoke" not in capsys.readouterr().out
 
 
 def test_another_authority_comes_with_a_list_of_its_own(service: Service, tmp_path: Path) -> None:
