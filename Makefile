@@ -4,7 +4,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Beside it, what is as pip installs it: not editable, with the state machines compiled.
+# Beside it, holdfast as pip installs it: not editable, with the state machines compiled. What it needs
+# of others it finds in the first.
 COMPILED := .venv-compiled
 
 # They stand inside the environment, so that they go when it goes.
@@ -26,6 +27,8 @@ RELEASED = $(shell git log -1 --format=%ct 2>/dev/null || date +%s)
 
 BUILD_TOOLS := 'scikit-build-core>=0.11' 'nanobind>=2.4' cmake ninja
 LAB_BUILD_TOOLS := 'hatchling>=1.27'
+# What makes C of the machines is in the environment of developers; it takes its own tools from this.
+MACHINE_BUILD_TOOLS := setuptools
 NATIVE_SOURCES := $(wildcard CMakeLists.txt) $(shell find cpp -type f)
 PACKAGE_SOURCES := $(shell find cmake src lab/src -type f -not -name '*.pyc') lab/pyproject.toml
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
@@ -66,7 +69,7 @@ test-slow: $(INSTALLED_DEV) ## what repeats them with more seeds, problems and m
 	$(PYTEST) $(LONG) -m slow
 
 test-compiled: $(INSTALLED_COMPILED) ## the simulator's tests and 10,000 seeds through compiled machines
-	$(COMPILED)/bin/pytest -q $(LONG) -m "slow or not slow" tests/scenarios tests/simulation/test_world.py \
+	$(COMPILED)/bin/python -m pytest -q $(LONG) -m "slow or not slow" tests/scenarios tests/simulation/test_world.py \
 	    tests/processes/test_compiled.py
 
 test-deploy: $(INSTALLED_DEV) ## images, tunnels and machines; root, and packages that .ci/run installs
@@ -188,7 +191,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(INSTALLED_TOOLS): pyproject.toml | $(BIN)/python
-	@cmake/pip_install $(BIN)/python $(VENV)/pip.log $(BUILD_TOOLS) $(LAB_BUILD_TOOLS)
+	@cmake/pip_install $(BIN)/python $(VENV)/pip.log $(BUILD_TOOLS) $(LAB_BUILD_TOOLS) $(MACHINE_BUILD_TOOLS)
 	@touch $@
 
 # With tools that stay where they are, only what has changed is compiled: pip's own are elsewhere
@@ -216,8 +219,14 @@ $(INSTALLED_DOCS): $(INSTALLED_FIGURES)
 	@cmake/pip_install $(BIN)/python $(VENV)/pip.log "holdfast-sensing[docs]"
 	@touch $@
 
-# The sources are copied into it, so whatever of them changes is installed again.
-$(INSTALLED_COMPILED): pyproject.toml $(NATIVE_SOURCES) $(PACKAGE_SOURCES) | $(BIN)/python
-	$(BIN)/python -m venv $(COMPILED)
-	@HOLDFAST_COMPILED=1 cmake/pip_install $(COMPILED)/bin/python $(COMPILED)/pip.log ".[test]" ./lab
+# The sources are copied into it, so whatever of them changes is installed again. The kernel is the one
+# of the first, whose build goes on: only the machines are compiled.
+$(INSTALLED_COMPILED): pyproject.toml $(NATIVE_SOURCES) $(PACKAGE_SOURCES) | $(INSTALLED_DEV)
+	rm -rf $(COMPILED)
+	$(BIN)/python -m venv --without-pip $(COMPILED)
+	@HOLDFAST_COMPILED=1 PIP_COMMAND=wheel cmake/pip_install $(BIN)/python $(COMPILED)/pip.log \
+	    --no-build-isolation --no-deps -w $(COMPILED)/wheels . ./lab
+	@$(BIN)/python -m pip --python $(COMPILED)/bin/python install -q --no-deps $(COMPILED)/wheels/*.whl
+	@cd $(COMPILED)/lib/python*/site-packages && $(CURDIR)/$(BIN)/python -c \
+	    'import sysconfig; print(sysconfig.get_path("purelib"))' >others.pth
 	@touch $@
