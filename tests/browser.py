@@ -1,7 +1,5 @@
 """A real browser without a network: Chromium, told over a pipe (the DevTools protocol)."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json

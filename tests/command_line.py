@@ -1,7 +1,5 @@
 """The command line in the test's own process: for what is decided before anything is started."""
 
-from __future__ import annotations
-
 import csv
 import importlib
 import json

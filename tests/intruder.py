@@ -6,8 +6,6 @@ moment of a link, over plain sockets (:mod:`tests.wire`), and notes whatever it 
 should not be.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import random

@@ -6,8 +6,6 @@ A feature pays with a removal. The budgets are in ``pyproject.toml``; what count
 Python. A part that has become smaller may lower its own.
 """
 
-from __future__ import annotations
-
 import sys
 import tomllib
 from pathlib import Path

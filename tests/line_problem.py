@@ -1,7 +1,5 @@
 """A small problem that keeps its contract, for tests of what happens when one does not."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a ROS 1 master knows of three nodes."""
 
-from __future__ import annotations
-
 from ros1_master_guard.process import MasterState
 
 ARM, BASE, LIDAR = "http://robot:1/", "http://robot:2/", "http://robot:3/"

@@ -14,8 +14,6 @@ of them kill nothing that another does not kill as well. Results are appended to
 call goes on.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import gc

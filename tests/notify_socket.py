@@ -1,7 +1,5 @@
 """The socket of a service manager, as systemd has one for each unit with ``Type=notify``."""
 
-from __future__ import annotations
-
 import contextlib
 import secrets
 import socket

@@ -1,7 +1,5 @@
 """Settings and a trial, small enough to be planned in every test of planning."""
 
-from __future__ import annotations
-
 from holdfast.planning.settings import (
     ActiveSensingSettings,
     ParticleFilterSettings,

@@ -6,8 +6,6 @@ to somebody else, if only to connect from. So tests take theirs from below those
 chooses from, each worker of pytest-xdist its own, one after another.
 """
 
-from __future__ import annotations
-
 import os
 
 from holdfast_lab.testbed.processes import Ports

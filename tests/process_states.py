@@ -1,7 +1,5 @@
 """The states of processes, and a SIGSTOP that has taken effect."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

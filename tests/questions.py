@@ -1,7 +1,5 @@
 """What a robot asks in a state, as a request: the one place where tests put it together."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from holdfast.config.loader import Configuration

@@ -1,7 +1,5 @@
 """A node of Ray on this machine, which is a cluster by itself."""
 
-from __future__ import annotations
-
 import contextlib
 import secrets
 import shutil

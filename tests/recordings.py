@@ -1,7 +1,5 @@
 """Small results, configurations and recorded trials for the tests of recording."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

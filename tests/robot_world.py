@@ -1,7 +1,5 @@
 """A robot's machine, with small services and an environment, under a virtual clock."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple

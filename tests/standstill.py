@@ -9,8 +9,6 @@ time must still come out the same::
 It takes Linux with version 2 of the control groups mounted (5.2 or newer), and root's rights.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import os

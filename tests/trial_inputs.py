@@ -1,7 +1,5 @@
 """Inputs of a trial, folded in at once."""
 
-from __future__ import annotations
-
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.inputs import Late, Moved, Reinitialised, Sensed, encode_floats
 from holdfast.planning.tracking import Trial

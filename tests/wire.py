@@ -6,8 +6,6 @@ who speaks. A frame is a header of nine bytes, little-endian: how many bytes fol
 kind it is (1), to which call it belongs (4).
 """
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import ssl

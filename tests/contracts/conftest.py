@@ -1,7 +1,5 @@
 """Fixtures of the transport's tests."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path

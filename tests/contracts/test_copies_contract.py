@@ -3,8 +3,6 @@
 A pool of processes pickles what it sends, a tree search copies the world at each of its nodes.
 """
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """Where datagrams go: spoofed and copied addresses, robots that move, forged reports of routers."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import socket

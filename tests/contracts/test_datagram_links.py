@@ -1,7 +1,5 @@
 """Links with datagrams beside the stream: who gets in, what goes which way, how an end is found."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import select

@@ -1,7 +1,5 @@
 """A problem's attributes mean the same as list, tuple or array, of Python's numbers or NumPy's."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

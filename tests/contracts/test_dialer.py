@@ -1,7 +1,5 @@
 """The dialer: several addresses of a name, and when it connects again."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import itertools

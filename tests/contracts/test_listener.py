@@ -1,7 +1,5 @@
 """The listener: visitors who are no peers, and many connections from one address."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import socket

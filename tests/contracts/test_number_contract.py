@@ -4,8 +4,6 @@ NumPy's integers and real numbers are numbers: they give what Python's give. A t
 a date, an object or an entry that a mask hides is none: the error names it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path

@@ -3,8 +3,6 @@
 A problem of your own can be put through the same checks: register it, and it is.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -4,8 +4,6 @@ Wrappers of simulators often do. Here every function of a problem, and the robot
 writes its results into one buffer for each shape, which all of them share.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

@@ -1,7 +1,5 @@
 """The robot's end: why a service is unreachable, early handshakes, and stalls of the process."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import functools

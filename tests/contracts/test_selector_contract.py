@@ -4,8 +4,6 @@ The promises: a valid index; a function of its arguments alone, to the last bit,
 of threads; nothing changed that was handed in; finite entropies even where a belief has collapsed.
 """
 
-from __future__ import annotations
-
 import itertools
 from typing import Any, get_args
 

@@ -1,7 +1,5 @@
 """The service's end: whose certificate it believes, and whose links it ends."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import ssl

@@ -1,7 +1,5 @@
 """What every wire must do, over all of them, in one process and between processes."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import signal

@@ -1,7 +1,5 @@
 """Links: streams and their frames, slow readers, and the other end's end."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import functools

@@ -6,8 +6,6 @@ one for its images that stays). The images' tags are digests of what they are ma
 that has not changed is not built again.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -4,8 +4,6 @@ It boots as a provider's does: systemd is process 1, and cloud-init finds user-d
 What a container cannot show is the provider's own network, disk and kernel.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil

@@ -3,8 +3,6 @@
 ``deploy/aarch64`` makes it, and a Debian for arm64, whose Python an emulated processor runs.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

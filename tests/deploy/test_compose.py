@@ -1,7 +1,5 @@
 """Robot and cloud as Compose starts them; the cloud comes to harm, and no decision changes."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import json

@@ -1,7 +1,5 @@
 """The first ten minutes of docs/deploy.md, typed as they stand there."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -4,8 +4,6 @@
 cdktf-cdktf-provider-aws 21.22; ``terraform validate`` would have to fetch the provider.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import re

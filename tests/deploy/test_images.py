@@ -1,7 +1,5 @@
 """The images: built of this tree and hardened. What runs in them decides as outside: Compose's."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tomllib

@@ -6,8 +6,6 @@ has the schemas of kinds that are not Kubernetes's own, strict, of the package
 cloudcoil-models-prometheus-operator 0.80.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

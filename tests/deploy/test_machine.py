@@ -1,7 +1,5 @@
 """A cloud machine from nothing, the units of both roles under a real systemd, and faults there."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

@@ -1,7 +1,5 @@
 """The alerts for Prometheus: each is set off, and watches what a service really tells."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

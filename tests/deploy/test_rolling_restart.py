@@ -5,8 +5,6 @@ same, says how. All leases and timeouts here are longer than the test: whatever 
 somebody's silence would be seen as a run that never ends.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

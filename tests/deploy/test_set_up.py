@@ -1,7 +1,5 @@
 """``deploy/cloud-init/set-up`` with an ssh that says no: what it sends where, and to whom."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The wheel that ``make wheel`` makes holds what it should, and runs where no compiler is."""
 
-from __future__ import annotations
-
 import platform
 import posixpath
 import subprocess

@@ -3,8 +3,6 @@
 The places come from the structs themselves: a setting that is added is attacked as well.
 """
 
-from __future__ import annotations
-
 import collections
 import itertools
 import random

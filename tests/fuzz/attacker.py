@@ -15,8 +15,6 @@ Attacker, service and robot share this machine's cores. Where the kernel groups 
 does, is woken up to 0.2 s late beside others that never sleep. That is no wait for the service.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import collections

@@ -1,7 +1,5 @@
 """One valid specimen of everything that is decoded, made by code: what fuzzing begins from."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple

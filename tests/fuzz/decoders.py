@@ -7,8 +7,6 @@ ones by what knows the format (``mutations.py``). A finding ends the process wit
 leaves the bytes in a file ``crash-*`` in the directory of ``--crashes``.
 """
 
-from __future__ import annotations
-
 import argparse
 import random
 import sys

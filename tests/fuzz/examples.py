@@ -1,7 +1,5 @@
 """How much Hypothesis draws: little each time, much in the slow tests."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Robots that use a service under attack; each decision is compared with the planner's own."""
 
-from __future__ import annotations
-
 import collections
 import threading
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Settings that cost as much as they can, found by looking at the settings' own bounds."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import random

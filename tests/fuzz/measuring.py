@@ -1,7 +1,5 @@
 """What a process holds, from outside: memory, descriptors, threads, over time."""
 
-from __future__ import annotations
-
 import statistics
 import threading
 import time

@@ -1,7 +1,5 @@
 """Bytes that mean harm, drawn by seed: spoilt messages, and none at all."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Sequence
 

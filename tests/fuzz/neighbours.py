@@ -5,8 +5,6 @@
 It prints a line when it has begun, and how often it did what it does when it ends; SIGTERM ends it.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import itertools

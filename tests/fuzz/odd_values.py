@@ -4,8 +4,6 @@ Each first byte has its values: numbers at the edges of their widths, texts that
 times that no calendar has, extensions, keys of every type, lengths that lie, and deep nesting.
 """
 
-from __future__ import annotations
-
 import itertools
 import random
 import struct

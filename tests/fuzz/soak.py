@@ -8,8 +8,6 @@ Beside them one robot runs all the time, and its two services are killed and sta
 processes hold is measured from outside; when it counts as flat is said in ``measuring.py``.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import random

@@ -1,7 +1,5 @@
 """What Hypothesis draws: every message, every record and every state, and what spoils them."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 

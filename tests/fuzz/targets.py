@@ -5,8 +5,6 @@ that the decoder documents, or are a message within its bounds which survives an
 Anything else, another exception above all, is a finding.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Mapping
 

@@ -4,8 +4,6 @@ What a stream says is read again here, all at once and by other code. The two mu
 frame before the first that is wrong, and memory stays bounded whatever a header announces.
 """
 
-from __future__ import annotations
-
 import random
 import struct
 import tracemalloc

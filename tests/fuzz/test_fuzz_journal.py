@@ -5,8 +5,6 @@ and entries whose checksums are right (left out, exchanged, of other types). Wha
 exactly what was written, a part of it from its beginning on, or an error that names the file.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random

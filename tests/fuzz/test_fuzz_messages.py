@@ -1,7 +1,5 @@
 """Every message, record and state: each survives its journey, and what is spoilt is found out."""
 
-from __future__ import annotations
-
 import random
 import tracemalloc
 

@@ -1,7 +1,5 @@
 """The fuzzers as programs, for a bounded time; `make fuzz` and `make soak` run them at length."""
 
-from __future__ import annotations
-
 import importlib.util
 import itertools
 import random

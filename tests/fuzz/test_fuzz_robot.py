@@ -6,8 +6,6 @@ that is not the answer must have no effect but on time; `Refused` is how a servi
 cannot.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 

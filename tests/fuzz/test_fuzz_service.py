@@ -4,8 +4,6 @@ Rules send whatever may come, in any order, and let jobs end in any order. After
 that the machine holds is measured, not only what it says of itself.
 """
 
-from __future__ import annotations
-
 import random
 from typing import Any
 

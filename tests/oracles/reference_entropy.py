@@ -3,8 +3,6 @@
 Shares no code with the kernel; SciPy's digamma, NumPy's sorting.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -52,9 +50,10 @@ def neighborhoods(
     for n in range(count):
         others = np.delete(np.arange(count), n)
         # Squares compared with squares, as a radius that is a square root would move ties apart.
-        squared = np.zeros(count - 1)
+        squared = np.zeros(count)
         for coordinate in range(dimension):
-            squared += (points[others, coordinate] - points[n, coordinate]) ** 2
+            squared += (points[:, coordinate] - points[n, coordinate]) ** 2
+        squared = squared[others]
         kth = np.partition(squared, k - 1)[k - 1]
         # Distances that differ by rounding alone are equal.
         tolerance = 1.0 + 2.0**-40

@@ -5,8 +5,6 @@ answer with the body's sizes larger and smaller by 2e-6. At most one pose in a t
 left out, and the 9,000 compared must hold many of both answers.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import fcl

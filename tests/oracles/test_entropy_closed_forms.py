@@ -21,8 +21,6 @@ right estimate fails it with probability 1e-6 over all seeds, and about 40 compa
 mistake of `POWER` in an expectation is found, as every test asserts.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import special, stats

@@ -2,13 +2,15 @@
 
 The kernel has several ways to an entropy and chooses by counts alone (cpp/src/entropy.cpp). Each
 is driven here on purpose, and the kernel's own count of the ways shows that it was taken, across
-dimensions, numbers of neighbours, ties, weights of zero and weights of very different sizes. Both
-sides are sums of a few thousand terms of about ten nats, each
-known to a few units in 1e16, so 1e-9 is generous for rounding and small for any mistake.
+dimensions, numbers of neighbours, ties, weights of zero and weights of very different sizes. Trees
+of more than 16,384 points are taken in blocks of leaves, whose arithmetic differs; the kernel is
+asked to do so with these small ones as well. Both sides are sums of a few thousand terms of about
+ten nats, each known to a few units in 1e16, so 1e-9 is generous for rounding and small for any
+mistake.
 """
 
-from __future__ import annotations
-
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -107,6 +109,20 @@ def find(
     return Found(result, visits, Ways(*ways))
 
 
+BLOCKS_BEYOND = 16_384
+"""Points in a tree beyond which it is taken in blocks."""
+
+
+@contextmanager
+def in_blocks() -> Iterator[None]:
+    """Let trees of any size be taken in blocks."""
+    assert _kernel.use_blocks_beyond(0) == BLOCKS_BEYOND
+    try:
+        yield
+    finally:
+        _kernel.use_blocks_beyond(BLOCKS_BEYOND)
+
+
 def by_trees(posteriors: int) -> Ways:
     """Return the way of posteriors of many points: one has a tree of its own, others share one."""
     return Ways(own_tree=1) if posteriors == 1 else Ways(grouped=posteriors)
@@ -120,12 +136,18 @@ def assert_found(
     ways: Ways,
     *rows: int,
 ) -> Found:
-    """Assert that the kernel took these ways, and what it has found for some posteriors."""
-    found = find(points, weights, NearestNeighbor(neighbors, resolution))
-    assert found.ways == ways
+    """Assert that the kernel took these ways, and what it has found for some posteriors, leaf by
+    leaf and in blocks; return what it has found leaf by leaf.
+    """
+    estimator = NearestNeighbor(neighbors, resolution)
+    found = find(points, weights, estimator)
+    with in_blocks():
+        blocks = find(points, weights, estimator)
+    assert found.ways == blocks.ways == ways
     for row in rows:
         expected = nearest_neighbor_entropy(points, weights[row], neighbors, resolution)
         assert abs(found.entropies[row] - expected) <= TOLERANCE, f"row {row}"
+        assert abs(blocks.entropies[row] - expected) <= TOLERANCE, f"row {row}, in blocks"
     return found
 
 

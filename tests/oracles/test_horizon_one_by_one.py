@@ -4,8 +4,6 @@ The reference is how they were computed before: the same functions, called for a
 results are equal to the last bit, for every problem, estimate and number of threads.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

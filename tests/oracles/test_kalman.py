@@ -8,8 +8,6 @@ with their own spread, failed by a right filter with probability 1e-6. About 800
 compared (dependent in time), so of all seeds 1e-3 would fail at most.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

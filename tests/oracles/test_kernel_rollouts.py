@@ -1,7 +1,5 @@
 """The kernel's rollouts of the built-in problems, robot by robot and step by step in Python."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,25 +1,21 @@
 """Nearest neighbours of many points, where the kernel takes the leaves of its tree in blocks.
 
 It does so in trees of more than 16,384 points. A belief of as many particles or fewer has no such
-tree, so its decisions keep the bits that they had before there were blocks. Here
-``use_blocks_beyond`` lets small trees be taken in blocks as well, whose entropies the reference
-gives in a short time.
+tree, so its decisions keep the bits that they had before there were blocks. What small trees give
+in blocks test_entropy_reference.py compares with the reference.
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from tests.oracles import test_entropy_reference as small
-from tests.oracles.test_entropy_reference import TOLERANCE, WAYS, draw_weights, find
+from tests.oracles.test_entropy_reference import BLOCKS_BEYOND as LIMIT
+from tests.oracles.test_entropy_reference import TOLERANCE, draw_weights, find
 
 from holdfast import _kernel
 from holdfast.numerics.arrays import FloatArray
 from holdfast.planning.estimators import NearestNeighbor
-
-LIMIT = 16_384
 
 
 def draw_belief(kind: str, count: int, dimension: int) -> FloatArray:
@@ -46,11 +42,6 @@ def usual_limit() -> Iterator[None]:
     _kernel.use_blocks_beyond(LIMIT)
 
 
-@pytest.fixture
-def in_blocks(usual_limit: None) -> None:
-    _kernel.use_blocks_beyond(0)
-
-
 @pytest.mark.parametrize("posteriors", [1, 9, 17, 27])
 @pytest.mark.parametrize(
     ("kind", "dimension", "resolution"),
@@ -64,7 +55,7 @@ def in_blocks(usual_limit: None) -> None:
     ],
 )
 def test_blocks_against_the_reference(
-    kind: str, dimension: int, resolution: float, posteriors: int, in_blocks: None
+    kind: str, dimension: int, resolution: float, posteriors: int
 ) -> None:
     """Twelve blocks of 256 points, the last of them not full."""
     count = 2900
@@ -72,24 +63,6 @@ def test_blocks_against_the_reference(
     rng = np.random.default_rng([8, posteriors])
     weights = draw_weights(rng, "similar", posteriors, count, count - 200)
     small.assert_found(points, weights, 5, resolution, small.by_trees(posteriors), -1)
-
-
-@pytest.mark.parametrize("neighbors", [1, 8, 9, 30])
-@pytest.mark.parametrize("way", [way for way in WAYS if not way.startswith("pair by pair")])
-def test_every_way_in_blocks(way: str, neighbors: int, in_blocks: None) -> None:
-    small.test_every_way(way, neighbors)
-
-
-@pytest.mark.parametrize(
-    "kind", ["spread", "grid", "line", "half at rest", "clusters", "one place"]
-)
-def test_ties_in_blocks(kind: str, in_blocks: None) -> None:
-    small.test_ties_and_numbers_of_neighbours(kind, 5)
-
-
-@pytest.mark.parametrize("posteriors", [1, 33])
-def test_a_point_among_its_copies_in_blocks(posteriors: int, in_blocks: None) -> None:
-    small.test_a_point_among_its_copies(posteriors)
 
 
 @pytest.mark.parametrize("posteriors", [1, 9])
@@ -121,7 +94,7 @@ def test_blocks_begin_beyond_the_limit(posteriors: int, usual_limit: None) -> No
         assert same == (count == LIMIT)
 
 
-def test_threads_change_no_bit(in_blocks: None) -> None:
+def test_threads_change_no_bit() -> None:
     count = 5000
     points = draw_belief("spread", 2 * count, 3)
     weights = np.abs(np.random.default_rng(10).normal(size=(9, count)))
@@ -129,12 +102,13 @@ def test_threads_change_no_bit(in_blocks: None) -> None:
     weights[8, count // 10 :] = 0.0
     before = _kernel.use_threads_from(0.0)
     try:
-        results = {
-            _kernel.entropies(
-                points, weights, False, 0, 5, 0.3, 0.0, 0.0, threads, (1.0, 0.5), np.empty(0)
-            )[0].tobytes()
-            for threads in (1, 2, 3, 64)
-        }
+        with small.in_blocks():
+            results = {
+                _kernel.entropies(
+                    points, weights, False, 0, 5, 0.3, 0.0, 0.0, threads, (1.0, 0.5), np.empty(0)
+                )[0].tobytes()
+                for threads in (1, 2, 3, 64)
+            }
     finally:
         _kernel.use_threads_from(before)
     assert len(results) == 1

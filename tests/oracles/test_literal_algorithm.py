@@ -4,8 +4,6 @@ The two share the problem's functions and the random numbers, and no more: SciPy
 digamma on one side, the kernel on the other. So the benchmark's ratio is one of equal work.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from benchmarks import literal

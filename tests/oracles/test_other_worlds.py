@@ -1,7 +1,5 @@
 """The worlds of others in ``benchmarks``: their models are the published ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from benchmarks import light_dark, rock_sample, source_location

@@ -1,7 +1,5 @@
 """The path entropy against its definition, written out particle by particle and step by step."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from typing import Any, Literal

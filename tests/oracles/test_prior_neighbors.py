@@ -4,8 +4,6 @@ The kernel takes the prior and its posteriors eight at a time, points in blocks 
 points on those that are equal together; the counts lie around these.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

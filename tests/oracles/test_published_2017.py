@@ -29,8 +29,6 @@ neither the logs nor the published source confirm, and among 200 to pass is no e
 reward is an expected failure below, and the row supports the successes alone.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 

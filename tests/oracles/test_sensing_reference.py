@@ -6,8 +6,6 @@ takes the numbers i L, i L + 1, ..., with L the size of the largest observation)
 the noise of predicted motion. Both sides round differently, so they agree to 1e-9, not to the bit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal
 

@@ -5,8 +5,6 @@ what is said below of false alarms is the probability that such a draw fails alt
 of success is 99.5 %, a little less than what was seen when the bounds were chosen.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -6,8 +6,6 @@ coordinate it is: in a unit that is a power of two of the old one to the last bi
 everything that holdfast computes is either the same or an exact multiple.
 """
 
-from __future__ import annotations
-
 from itertools import product
 from typing import Any, NamedTuple
 

@@ -7,8 +7,6 @@ With the variable ``HOLDFAST_TEST_STUCK`` (a file) it raises instead of moving w
 there.
 """
 
-from __future__ import annotations
-
 import os
 import socket
 

@@ -3,8 +3,6 @@
 It is run by ``test_journal_disk_errors``, which lets the system fail under it.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

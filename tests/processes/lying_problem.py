@@ -10,8 +10,6 @@ but the decisions tells such a service from an honest one.
 With ``HOLDFAST_TEST_OWN_PLANNER_HANGS`` a robot's own planner never comes to a decision.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 import time

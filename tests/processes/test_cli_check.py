@@ -1,7 +1,5 @@
 """``holdfast check``: what it prints, its exit codes, and problems that end or hang its process."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``holdfast compare``, as a person types it, on real runs."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``holdfast sweep``, as a person types it."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

@@ -5,8 +5,6 @@ schedules go through both, and everything that is told of the runs is compared. 
 installation: a copy of it without its extension modules of machines is interpreted.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

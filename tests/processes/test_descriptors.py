@@ -1,7 +1,5 @@
 """Commands that may have few files and sockets open: they work, or say so before they begin."""
 
-from __future__ import annotations
-
 import contextlib
 import resource
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How a process ends that uses the kernel."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

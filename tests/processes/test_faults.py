@@ -4,8 +4,6 @@ Each run is compared, bit for bit, with an undisturbed one; each task action was
 order, which the world itself has witnessed; and the statuses passed are the thesis's.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 

@@ -1,7 +1,5 @@
 """A finished run whose figure cannot be drawn here: it ends with 0 and a remark."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

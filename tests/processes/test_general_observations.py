@@ -3,8 +3,6 @@
 The example has ``log_likelihood`` and ``sample_observation`` alone, as a user's problem may.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import subprocess

@@ -1,7 +1,5 @@
 """Runs in environments of gymnasium: how crashes are told, and what happens after a kill."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A service that comes and goes many times a second cannot fill a robot's log."""
 
-from __future__ import annotations
-
 import collections
 import contextlib
 import datetime as dt

@@ -1,7 +1,5 @@
 """Whose certificate is revoked or expires is cut off at once, and nobody else notices."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

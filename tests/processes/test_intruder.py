@@ -6,8 +6,6 @@ runs. Nothing of the other session reaches it, and the honest run is the same as
 for bit.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path

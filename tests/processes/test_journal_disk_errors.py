@@ -4,8 +4,6 @@
 there afterwards, what is there must be known to be all, and the journal must be of use.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 import tempfile

@@ -4,8 +4,6 @@ A silence is given up after the lease that the silent end has announced when the
 How long that takes depends on the machine; what is announced does not, so it is read on the wire.
 """
 
-from __future__ import annotations
-
 import asyncio
 import socket
 from pathlib import Path

@@ -3,8 +3,6 @@
 It says what is the matter with which file, and whatever it does then, it performs nothing twice.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """The peg in MuJoCo with its cloud killed: motions and forces lead to the same decisions."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 from pathlib import Path

@@ -3,8 +3,6 @@
 How long robots wait meanwhile is measured by ``python benchmarks/run.py --only neighbours``.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A service whose copy of the problem, or whose holdfast, is not the robot's."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The controller is another process with another program, and its log is the witne
 each step was performed once, in order, and as in a run in which nothing died.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import subprocess

@@ -4,8 +4,6 @@ docs/deploy.md and docs/ros.md need machines of their own: tests/deploy/test_dep
 tests/processes/test_ros_page_commands.py run theirs.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

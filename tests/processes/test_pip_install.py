@@ -1,7 +1,5 @@
 """The make targets' pip: silent but for one line, and as good as pip itself at failing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from tests.programs import completed

@@ -1,7 +1,5 @@
 """Problems as gymnasium environments in worker processes, as learning on several cores has them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium

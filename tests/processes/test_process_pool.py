@@ -1,7 +1,5 @@
 """A pool of processes, as a user of Python makes one, goes on with trials."""
 
-from __future__ import annotations
-
 import multiprocessing
 import subprocess
 import sys

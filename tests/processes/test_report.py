@@ -1,7 +1,5 @@
 """``holdfast report`` in a real browser without a network, of a run whose words are hostile."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A run is shown in a viewer of its own process: Rerun's server stands for the window."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import signal

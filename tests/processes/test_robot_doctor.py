@@ -1,7 +1,5 @@
 """``holdfast doctor``: each layer that can fail, really failing, and what is said of it."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import functools

@@ -3,8 +3,6 @@
 Whatever was performed is performed once: the world, which outlives the robot, has counted it.
 """
 
-from __future__ import annotations
-
 import os
 import pty
 import shlex

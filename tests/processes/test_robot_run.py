@@ -1,7 +1,5 @@
 """The trials of a run as a robot performs them: the same decisions, and a row for each."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from tests.recordings import configuration_of, record_trial

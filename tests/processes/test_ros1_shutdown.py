@@ -1,7 +1,5 @@
 """What ROS 1 asks to end ends; what a service offers beside it goes on."""
 
-from __future__ import annotations
-
 import xmlrpc.client
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What the page about ROS says of exported runs, typed as it stands there."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

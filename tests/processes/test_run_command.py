@@ -1,7 +1,5 @@
 """``holdfast run`` as a person runs it: the real command, real processes, real signals."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

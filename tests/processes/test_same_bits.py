@@ -6,8 +6,6 @@ choices by processor taken away, which stands in for another machine. What is co
 of each trial: a hash of every decision, every action and every belief that an observation led to.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import os

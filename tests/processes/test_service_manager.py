@@ -1,7 +1,5 @@
 """What systemd hears from a process, over a real socket."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import socket

@@ -1,7 +1,5 @@
 """``holdfast serve`` as a robot and an operator meet it: real processes, sockets and signals."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

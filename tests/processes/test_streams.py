@@ -1,7 +1,5 @@
 """A standard output that nobody reads any more, or that is full: ``holdfast simulate | head``."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``serve --processes``: several processes behind one address, of which any may die at any time."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

@@ -1,7 +1,5 @@
 """Services behind mutual TLS: their faults change no decision, and strangers stay outside."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -4,8 +4,6 @@ The commands are real; what a robot remembers that is killed in the step that en
 unit/test_protocol_robot.py.
 """
 
-from __future__ import annotations
-
 import shutil
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Services over UDP: what becomes of datagrams, or of the stream, changes no decision."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 The commands are real processes, the service manager is a real socket, and health is asked by HTTP.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """A process whose event loop stands still ends itself; one that was only stopped does not."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

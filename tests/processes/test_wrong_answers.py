@@ -1,7 +1,5 @@
 """A service that lies, or errs: real processes, in which only the decisions tell it apart."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest

@@ -4,8 +4,6 @@ A class as a user writes one: it knows nothing of holdfast. It is imported by th
 tests, by its name in their configuration.
 """
 
-from __future__ import annotations
-
 import json
 import socket
 from typing import Any

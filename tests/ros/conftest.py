@@ -1,7 +1,5 @@
 """What the tests with a real ROS begin with."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

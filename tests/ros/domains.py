@@ -1,7 +1,5 @@
 """A domain of ROS 2 for each test: what other tests do at the same time is not heard there."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import random

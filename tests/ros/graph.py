@@ -1,7 +1,5 @@
 """A ROS 1 graph of its own: a guard, masters, and nodes of others, each of which ends with it."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

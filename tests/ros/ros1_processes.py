@@ -1,7 +1,5 @@
 """A real ROS 1 master, and processes around it, each of which ends with its test."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

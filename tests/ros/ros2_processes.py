@@ -1,7 +1,5 @@
 """Processes of a real ROS 2, which are told what to do line by line."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import queue

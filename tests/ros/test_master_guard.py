@@ -1,7 +1,5 @@
 """A ROS 1 master that dies, and nodes of others that do not notice: real masters, stock nodes."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

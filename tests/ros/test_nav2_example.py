@@ -3,8 +3,6 @@
 ``nav2_msgs`` is built of its definitions; the example's stand-in plays ``BasicNavigator`` and AMCL.
 """
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """catkin builds our interfaces, and a node in roscpp that is built on them calls our service."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """A run over ROS 1 in whose midst the guarded master is killed, again and again."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import time

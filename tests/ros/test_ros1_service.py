@@ -1,7 +1,5 @@
 """The typed service in a real ROS 1: stock tools and clients use it, and a run loses nothing."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import os

@@ -3,8 +3,6 @@
 Launch itself has no wheel. Its file runs with a stand-in, and the tests start what it starts.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import runpy

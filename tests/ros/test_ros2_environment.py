@@ -1,7 +1,5 @@
 """A robot that is reached through ROS 2: other processes, which play it well and badly."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The node of ROS 2, with another process of ROS 2 as its client, its robot and its audience."""
 
-from __future__ import annotations
-
 import json
 import signal
 import threading

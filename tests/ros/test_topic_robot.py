@@ -1,7 +1,5 @@
 """The example of a robot on topics, a Python class with rclpy, drives its arm in a real ROS."""
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Iterator

@@ -4,8 +4,6 @@
 read like any other change of behaviour.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -9,8 +9,6 @@ change of the production code that makes a defect meaningless is an error and no
 ``python -m tests.simulation.defects`` prints a table of how many seeds each takes.
 """
 
-from __future__ import annotations
-
 import argparse
 import multiprocessing
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Deliberate defects about what comes late, what moves show and sensing that is left out."""
 
-from __future__ import annotations
-
 from tests.simulation.edits import Change, Defect, Edit
 
 from holdfast.planning.tracking import Trial

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 from tests.simulation.defects import DEFECTS, seeds_needed, violation_of, without_faults
 from tests.simulation.edits import Defect, Edit, applied

@@ -6,8 +6,6 @@ as they were. Whoever opens the file then must find all that was acted on, or kn
 missing. Planted defects show that this would be found out.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import tempfile

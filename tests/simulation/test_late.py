@@ -1,7 +1,5 @@
 """Late observations, moves that show something and sensing that is left out, each by itself."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

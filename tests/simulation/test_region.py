@@ -3,8 +3,6 @@
 Each decision is compared with the undisturbed one as it is performed.
 """
 
-from __future__ import annotations
-
 import msgspec
 import pytest
 from _pytest.mark import ParameterSet

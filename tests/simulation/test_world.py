@@ -1,7 +1,5 @@
 """The production machines under drawn schedules: whatever happens, the decisions are the same."""
 
-from __future__ import annotations
-
 import pytest
 
 from holdfast_lab.simulation.exploration import ExplorationTally, explore

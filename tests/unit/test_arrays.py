@@ -1,7 +1,5 @@
 """How arrays and numbers are read, and how a message shows an array."""
 
-from __future__ import annotations
-
 import copy
 from decimal import Decimal
 from typing import Any

@@ -1,7 +1,5 @@
 """Weighted particles: Bayes' rule, means, resampling, and observations that nothing explains."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Angles: pi is -pi in means, spreads, distances, observations and choices."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """How long computations are expected to take."""
 
-from __future__ import annotations
-
 import pytest
 
 from holdfast.protocol.computing_time import _TYPICAL_INERTIA, ExpectedTime

@@ -1,7 +1,5 @@
 """The tables of an exported run: what is not known is an empty cell."""
 
-from __future__ import annotations
-
 import csv
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every number of the settings is a factor of the cost, or is listed as none."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, get_args
 

@@ -1,7 +1,5 @@
 """Which service is asked, and when the local one takes over."""
 
-from __future__ import annotations
-
 import pytest
 from tests.robot_world import LOCAL, SmallService, World, answer_third_slowly, nth
 

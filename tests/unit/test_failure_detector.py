@@ -1,7 +1,5 @@
 """Evidence that a service is dead or only slow."""
 
-from __future__ import annotations
-
 import pytest
 
 from holdfast.protocol.failure_detector import FailureDetector

@@ -1,7 +1,5 @@
 """The caller's floating-point mode changes no decision, stops nothing, and stays the caller's."""
 
-from __future__ import annotations
-
 import ctypes
 import ctypes.util
 import platform

@@ -1,7 +1,5 @@
 """Worlds: collision in cases that can be checked by hand, motion against a readable reference."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import TypeAlias
 

@@ -1,7 +1,5 @@
 """What a killed process leaves, what a power cut leaves, and what damage does to it."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os

@@ -1,7 +1,5 @@
 """Reading a journal: finished trials, kept steps, other files and versions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

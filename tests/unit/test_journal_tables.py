@@ -1,7 +1,5 @@
 """``trials.csv`` and ``summary.json``."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """When the local service is launched again, and how often a late question is asked twice."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

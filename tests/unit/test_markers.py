@@ -1,7 +1,5 @@
 """Shapes for RViz and Foxglove: the scene, and the chosen sensing action."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

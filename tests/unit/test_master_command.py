@@ -1,7 +1,5 @@
 """The guard's command line, before it starts a master; tests/ros has the rest."""
 
-from __future__ import annotations
-
 import pytest
 
 from ros1_master_guard.command import main

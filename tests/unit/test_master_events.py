@@ -1,7 +1,5 @@
 """The guard's log: one line an event, whatever is in it."""
 
-from __future__ import annotations
-
 import io
 import json
 

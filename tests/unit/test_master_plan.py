@@ -1,7 +1,5 @@
 """The state of a new ROS 1 master: what the last one knew, without who has ended."""
 
-from __future__ import annotations
-
 from tests.master_state import ARM, BASE, LIDAR, known
 
 from ros1_master_guard.plan import without

@@ -1,7 +1,5 @@
 """What a ROS 1 master tells its guard, and the state that comes of it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

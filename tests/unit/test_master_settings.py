@@ -1,7 +1,5 @@
 """The guard's lock and the master's address."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

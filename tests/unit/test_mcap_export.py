@@ -1,7 +1,5 @@
 """A recorded run as an MCAP file: messages by topic, read back by rosbags."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A planner with a memo cache: the same states, each computed once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The heaviest mode of a belief: found where there are several, and nothing changed where not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

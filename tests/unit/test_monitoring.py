@@ -1,7 +1,5 @@
 """Health over HTTP: what is asked and answered, over real sockets on one event loop."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import contextlib

@@ -1,7 +1,5 @@
 """A peg and the holes of several plates."""
 
-from __future__ import annotations
-
 import pytest
 
 from holdfast.errors import InvalidValueError

@@ -1,7 +1,5 @@
 """The example for Nav2 without ROS: recorded particles, and chosen looks against spinning."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

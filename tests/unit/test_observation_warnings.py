@@ -1,7 +1,5 @@
 """What a robot tells of what it observes, and does where it is lost, through its state machine."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Journals of earlier versions: read where they are, and gone on with in the form of today."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import sqlite3

@@ -1,7 +1,5 @@
 """What cannot be an option's value is refused with one line, whichever command and option it is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """A trial's decisions as bytes, and its outcome."""
 
-from __future__ import annotations
-
 import hashlib
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Comparing outcomes: known effects are found, intervals cover, and wrong pairs are refused."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

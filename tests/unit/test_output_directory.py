@@ -1,7 +1,5 @@
 """The directory of a command's findings."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Values that a command line gives instead of the file's: none is lost or contradicted."""
 
-from __future__ import annotations
-
 import typing
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The robot's own planner: parts of answers on the loop or a thread, and whole ones in order."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import threading

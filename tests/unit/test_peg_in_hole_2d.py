@@ -1,7 +1,5 @@
 """A peg and a hole in the plane."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A peg and a hole in space."""
 
-from __future__ import annotations
-
 import pytest
 
 from holdfast.errors import InvalidValueError

@@ -1,7 +1,5 @@
 """What a session configuration's free sections may hold, at each bound and just beyond it."""
 
-from __future__ import annotations
-
 import datetime as dt
 import math
 

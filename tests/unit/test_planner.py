@@ -1,7 +1,5 @@
 """Planning: pure functions of a state, which any process goes on from."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """States as bytes: their digest and their checkpoint."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import msgspec

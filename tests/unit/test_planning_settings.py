@@ -1,7 +1,5 @@
 """Settings that are made in Python."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any

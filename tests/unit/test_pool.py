@@ -1,7 +1,5 @@
 """Threads of both shells: results come back to the loop, and errors do, too."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import sys

@@ -1,7 +1,5 @@
 """Beliefs as poses: what a problem says of its coordinates, and SciPy's rotations as the oracle."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Nothing from outside moves the terminal's cursor, whatever a command says of it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

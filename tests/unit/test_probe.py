@@ -1,7 +1,5 @@
 """One address of a service: certificates, interfaces, and calls that cannot be broken off."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import threading

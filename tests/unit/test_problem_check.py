@@ -1,7 +1,5 @@
 """``hf.check_problem``: right problems have no error, and wrong ones have theirs named."""
 
-from __future__ import annotations
-
 import importlib
 import random
 import re

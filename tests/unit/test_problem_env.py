@@ -1,7 +1,5 @@
 """A problem as a gymnasium environment, in which an agent chooses what is sensed."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which problems a service builds, and for whom it refuses to."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A problem's attributes and the parameters of its functions."""
 
-from __future__ import annotations
-
 import inspect
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The bounds of the problems' settings, declared in holdfast.problems.rigid_body."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

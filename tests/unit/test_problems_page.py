@@ -1,7 +1,5 @@
 """The page of the problems names every setting of each built-in problem, with default and unit."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

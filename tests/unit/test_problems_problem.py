@@ -1,7 +1,5 @@
 """The defaults of a problem."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How the end of a process is told, and how soon the next one starts."""
 
-from __future__ import annotations
-
 import itertools
 import signal
 

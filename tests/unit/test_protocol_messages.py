@@ -1,7 +1,5 @@
 """The codec: what goes in comes out, and what is no message is said to be none."""
 
-from __future__ import annotations
-
 import math
 import random
 import struct

@@ -1,7 +1,5 @@
 """Requests in flight, and replies that are lost, damaged or wrong."""
 
-from __future__ import annotations
-
 import numpy as np
 from tests.robot_world import World, nth
 

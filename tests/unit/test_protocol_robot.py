@@ -1,7 +1,5 @@
 """The robot's loop: its journal, its environment and its trials."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterator
 

@@ -1,7 +1,5 @@
 """The table of the statuses, and the page that is made from it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

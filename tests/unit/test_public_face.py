@@ -1,7 +1,5 @@
 """The public face, ``import holdfast as hf``: its names, and what importing it costs."""
 
-from __future__ import annotations
-
 import ast
 import importlib.metadata
 import sys

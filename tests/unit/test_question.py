@@ -1,7 +1,5 @@
 """A question's size, which replies can answer it, and what both sources of decisions offer."""
 
-from __future__ import annotations
-
 import inspect
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The race, on candidates whose true costs are known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np

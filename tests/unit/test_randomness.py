@@ -5,8 +5,6 @@ Seeds are fixed. The statistical bounds below would each fail with the stated pr
 seed were drawn anew.
 """
 
-from __future__ import annotations
-
 import copy
 import itertools
 import pickle

@@ -1,7 +1,5 @@
 """Trials on a real Ray cluster: a head, and a node of one core."""
 
-from __future__ import annotations
-
 import csv
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A run that another version began goes on only if that version's decisions come out again."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A recorded trial, run again from its records."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

@@ -1,7 +1,5 @@
 """The local service as a process of its own: started, replaced, ended, and missed."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

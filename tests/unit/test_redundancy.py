@@ -1,7 +1,5 @@
 """Copies of datagrams and the budget that they share."""
 
-from __future__ import annotations
-
 import math
 
 from holdfast.transport.redundancy import COPY_DELAY_S, Paths, RedundantSender

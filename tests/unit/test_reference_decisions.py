@@ -1,7 +1,5 @@
 """The robot's own first decisions, and answers that agree with them or differ."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The page on reliability names each line of a simulated schedule, and each kind of real fault."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints

@@ -1,7 +1,5 @@
 """A recorded run, planned again: its facts are those of the run, and its decisions the recorded."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock

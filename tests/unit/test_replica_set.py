@@ -1,7 +1,5 @@
 """What a robot knows of the services."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any, cast
 

@@ -1,7 +1,5 @@
 """Comparing two runs: what is the same, and the first thing that is not."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

@@ -1,7 +1,5 @@
 """A recorded run as arrays: what is read is what was run."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

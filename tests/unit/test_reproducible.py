@@ -4,8 +4,6 @@ The true values are those of the C library's long double functions, which on mos
 eleven more bits or sixty more; where they have none, the accuracy cannot be judged and is not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

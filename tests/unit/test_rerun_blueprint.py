@@ -1,7 +1,5 @@
 """Which coordinates are drawn in space: the problem's pose, else its drawing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

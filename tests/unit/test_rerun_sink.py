@@ -1,7 +1,5 @@
 """Facts as Rerun shows them: written to a file, and read back by Rerun's own reader."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is logged goes to each sink; a viewer that takes nothing is given up, a file goes on."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Where a service's datagrams go, step by step."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from hypothesis import given

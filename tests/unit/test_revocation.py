@@ -1,7 +1,5 @@
 """Revoking certificates: what is written, what a handshake makes of it, and reading the list."""
 
-from __future__ import annotations
-
 import base64
 import shutil
 from datetime import UTC, datetime, timedelta

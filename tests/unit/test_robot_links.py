@@ -1,7 +1,5 @@
 """From a configuration to a robot's links."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

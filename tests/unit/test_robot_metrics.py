@@ -1,7 +1,5 @@
 """A robot's metrics are what its machine has counted, in the text format of Prometheus."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

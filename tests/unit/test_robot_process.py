@@ -1,7 +1,5 @@
 """The robot's process on its event loop: what is handled when, what ends it, who is blamed."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

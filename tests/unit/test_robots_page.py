@@ -1,7 +1,5 @@
 """docs/robots.md: what it quotes stands in the example, and what it says of it is so."""
 
-from __future__ import annotations
-
 import re
 import textwrap
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Questions to ROS 1 masters, nodes and services that answer, refuse, hang or talk nonsense."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import xmlrpc.client

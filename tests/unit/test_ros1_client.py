@@ -1,7 +1,5 @@
 """A client of a service in ROS 1, against a master and a service that are not there, or refuse."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Iterator

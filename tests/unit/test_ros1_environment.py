@@ -1,7 +1,5 @@
 """ROS 1's answers, names and surroundings, as bytes and text."""
 
-from __future__ import annotations
-
 import pytest
 
 from holdfast.errors import TransportError

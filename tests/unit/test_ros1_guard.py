@@ -1,7 +1,5 @@
 """``holdfast ros1-guard`` before it starts a master; tests/ros has the rest."""
 
-from __future__ import annotations
-
 import pytest
 from tests.command_line import Workplace
 

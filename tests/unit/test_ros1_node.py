@@ -1,7 +1,5 @@
 """A node of ROS 1 among masters that lie, and among those who do not speak as they should."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import gc

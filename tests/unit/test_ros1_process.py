@@ -1,7 +1,5 @@
 """``holdfast ros1-serve`` starts only if all that it is to offer can be offered."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``holdfast ros1-serve`` as a command among the others; test_ros1_process.py has the rest."""
 
-from __future__ import annotations
-
 from tests.command_line import Workplace
 
 

@@ -1,7 +1,5 @@
 """The typed service in ROS 1 while it is asked for more than it can do, and at its end."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What /diagnostics says of a run: how bad it is, and what is known last."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The node's command line, as far as it goes without ROS."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import pytest

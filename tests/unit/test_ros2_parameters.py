@@ -1,7 +1,5 @@
 """The node's parameters: the settings' keys and its own, without ROS."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A segment of a run on a thread of its own: how it ends, and that the next one goes on."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from pathlib import Path

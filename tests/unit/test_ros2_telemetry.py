@@ -1,7 +1,5 @@
 """What is shown of a run: complete if there is time, and never waited for."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

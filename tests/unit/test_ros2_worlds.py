@@ -1,7 +1,5 @@
 """The environments of a node: the configuration's own, and an executive's."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

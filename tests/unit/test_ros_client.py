@@ -1,7 +1,5 @@
 """The client of two services: who decides, when, and what it says."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from pathlib import Path

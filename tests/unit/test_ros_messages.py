@@ -3,8 +3,6 @@
 The MD5 sum is genmsg's; tests/ros/test_ros1_service.py has rospy at the other end.
 """
 
-from __future__ import annotations
-
 import contextlib
 import struct
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What the page about ROS shows of its example is what stands there; layouts show all there is."""
 
-from __future__ import annotations
-
 import ast
 import json
 from pathlib import Path

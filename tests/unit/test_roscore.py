@@ -1,7 +1,5 @@
 """What belongs to a master: how processes end."""
 
-from __future__ import annotations
-
 import pytest
 
 from ros1_master_guard.roscore import how_it_ended

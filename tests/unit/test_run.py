@@ -3,8 +3,6 @@
 ``tests/processes/test_run_command.py`` has what only a process of its own can show.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import os

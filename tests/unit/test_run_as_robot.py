@@ -1,7 +1,5 @@
 """Which runs are a robot's, and why services were given up."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

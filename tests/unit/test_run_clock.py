@@ -1,7 +1,5 @@
 """When something was in a run, although the robot's wall clock was set meanwhile."""
 
-from __future__ import annotations
-
 import itertools
 
 from holdfast.journal.run_clock import RunClock, Stamp, read_clocks

@@ -1,7 +1,5 @@
 """The directory of a run: claimed, resumed, and what is in it."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path

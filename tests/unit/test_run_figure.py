@@ -3,8 +3,6 @@
 Where the trial is first decided otherwise then, and which service had decided.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The options of ``holdfast run`` and the command that goes on."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Events: sinks, and the limit on repeated ones."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

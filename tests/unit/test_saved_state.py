@@ -1,7 +1,5 @@
 """The file from which a guard goes on after it was killed with its master."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

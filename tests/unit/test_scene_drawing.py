@@ -1,7 +1,5 @@
 """What of a scene is drawn, and where."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from holdfast.problems.problem import Scene

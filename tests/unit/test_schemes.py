@@ -1,7 +1,5 @@
 """The links of each protocol."""
 
-from __future__ import annotations
-
 from tests.programs import said_by
 
 

@@ -1,7 +1,5 @@
 """Choosing what to sense: ties, the choices that imagine nothing, and what is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

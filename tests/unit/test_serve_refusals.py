@@ -1,7 +1,5 @@
 """What ``holdfast serve`` refuses before it listens: in words, with exit code 2."""
 
-from __future__ import annotations
-
 import pytest
 from tests.command_line import Workplace
 

@@ -1,7 +1,5 @@
 """Brief jobs that are computed at once: results, and what is left to each job alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import msgspec

@@ -1,7 +1,5 @@
 """When a service reads its credentials again, look by look."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Jobs are pure functions of what they were made with; problems are lent to one at a time."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import pytest

@@ -1,7 +1,5 @@
 """Long decisions leave threads to the others, and end once nobody awaits them."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

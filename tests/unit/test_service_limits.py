@@ -1,7 +1,5 @@
 """Limits of a service, and what it counts."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The address of several processes: whose it is, and what a process's end costs it."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """Metrics as Prometheus reads them, parsed by its own parser; and how they are added up."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Calls that wait, and what they are sent."""
 
-from __future__ import annotations
-
 import pytest
 from tests.unit.test_protocol_service import Robot
 

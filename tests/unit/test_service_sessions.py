@@ -1,7 +1,5 @@
 """What a service remembers of each robot, and of sessions that it has forgotten."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A service's event loop and threads, over the wire inside one process."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import gc

@@ -1,7 +1,5 @@
 """The page of the settings names every key with its default."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

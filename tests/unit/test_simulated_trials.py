@@ -1,7 +1,5 @@
 """Many trials as a table, and tables compared."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import dataclasses

@@ -1,7 +1,5 @@
 """Processes that outlive the guard, and one that waits to be a master."""
 
-from __future__ import annotations
-
 import signal
 import socket
 import sys

@@ -1,7 +1,5 @@
 """The clock of a recorded run: recorded times are kept, others are spread evenly."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Links whose certificates are revoked or expire: they end, and no others do."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import socket

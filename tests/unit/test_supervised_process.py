@@ -1,7 +1,5 @@
 """When a process of a service is taken for stuck, and killed; the test is the clock."""
 
-from __future__ import annotations
-
 import subprocess
 from typing import cast
 

@@ -1,7 +1,5 @@
 """Questions to a stock master and its nodes, all at once."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import threading

@@ -1,7 +1,5 @@
 """One table in the formats in which it is passed on."""
 
-from __future__ import annotations
-
 import csv
 import sys
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What a person sees of a run's progress and times."""
 
-from __future__ import annotations
-
 import pytest
 from tests.recordings import result_of
 

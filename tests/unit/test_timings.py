@@ -1,7 +1,5 @@
 """The table of a run's decisions: what a row says, and what becomes of a row that was cut off."""
 
-from __future__ import annotations
-
 import csv
 import os
 from pathlib import Path

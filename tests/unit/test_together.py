@@ -1,7 +1,5 @@
 """Several states decided at once: the bits are those of each alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The example examples/taskboard: what its planner believes, and, where the package is, its arm."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 from typing import Any

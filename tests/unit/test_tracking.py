@@ -1,7 +1,5 @@
 """A trial as it goes: late observations, what moves show, and beginning the belief anew."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The table of calls in flight: each call's events in order, and one end."""
 
-from __future__ import annotations
-
 from holdfast.protocol.messages import Refused, decode_reply
 from holdfast.protocol.robot_events import (
     CallEnded,

@@ -1,7 +1,5 @@
 """Credentials: loaded, checked before a link is opened, and on real links."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import importlib

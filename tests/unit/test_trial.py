@@ -1,7 +1,5 @@
 """The loop of one trial."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from pathlib import Path

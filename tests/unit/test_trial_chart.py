@@ -1,7 +1,5 @@
 """A trial as a chart: what is kept of it, and where it has no truth, scene or scores."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """One pool of workers for the trials of several configurations."""
 
-from __future__ import annotations
-
 import dataclasses
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """Many trials, in one process and in several."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The examples of robots in trouble: each is found, told, and mended as its page says."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A grid of settings on the same worlds."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping
 from pathlib import Path

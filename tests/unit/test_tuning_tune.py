@@ -1,7 +1,5 @@
 """A whole tuning, of a few short trials."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Code that is not ours: whose a frame of a traceback is, and what is said of what it raises."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The place of a mistake is data: keys and indices that lead to the value."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 import msgspec

@@ -1,7 +1,5 @@
 """The validation gate: its odds, its two distances, its covariance."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

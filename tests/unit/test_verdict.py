@@ -1,7 +1,5 @@
 """What fresh trials say of a race's winner."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

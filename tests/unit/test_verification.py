@@ -1,7 +1,5 @@
 """A service that lies, or errs, is found out by the robot, which does what its own planner says."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import msgspec

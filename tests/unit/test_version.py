@@ -1,7 +1,5 @@
 """The version stands in five files for several kinds of reader; they must be told the same."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from importlib import metadata

@@ -1,7 +1,5 @@
 """Where a run is shown, and what is said where it cannot be."""
 
-from __future__ import annotations
-
 from importlib.metadata import PackageNotFoundError
 
 import pytest

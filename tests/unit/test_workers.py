@@ -1,7 +1,5 @@
 """Worker processes that are ended, or end, at the worst moment."""
 
-from __future__ import annotations
-
 import os
 import signal
 import struct

@@ -1,7 +1,5 @@
 """YAML: what is written is read back, by this reader and by another one, and lines are right."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

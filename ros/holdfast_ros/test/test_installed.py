@@ -1,7 +1,5 @@
 """For ``colcon test``: the package is installed beside its interfaces, and has what it needs."""
 
-from __future__ import annotations
-
 import importlib
 
 import pytest
