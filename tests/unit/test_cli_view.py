@@ -126,7 +126,7 @@ RUN_AGAIN = ("run", "run.yaml", "--out", "live")
     [
         (("view", "run", "--save", "run.yaml"), "run.yaml: exists already"),
         (("view", "run", "--save", "run.rrd", "--trials", "7:9"), "has no trial from 7 to 8"),
-        (("view", "run"), "there is no display for Rerun's viewer"),
+        (("view", "run"), "write a file instead (view RUN --save FILE, "),
         (("view", "run", "--viewer", "127.0.0.1:1"), "no Rerun viewer listens at"),
         ((*RUN_AGAIN, "--view-file", "run.yaml"), "run.yaml: exists already"),
         ((*RUN_AGAIN, "--view-file", "live.rrd", "--jobs", "2"), "leave out --service"),

@@ -239,7 +239,7 @@ class TestBadInput:
             "move": lambda: planner.advance(state, np.zeros(3)),
             "policy": lambda: planner.choose_task_action(state),
         }
-        says = "gives" if function == "policy" else "put particle 7 at"
+        says = "gives" if function == "policy" else "put particle 7 at .*: every"
         with pytest.raises(ProblemError, match=f"{function} of peg_in_hole_2d {says}"):
             calls[function]()
 

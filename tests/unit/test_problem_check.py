@@ -330,6 +330,14 @@ def test_what_a_sensor_alone_shows_is_not_dominated(seed: int) -> None:
     ]
 
 
+@pytest.mark.parametrize("declared", [(), (0,)])
+def test_static_parameters_are_advised_where_none_are_declared(declared: tuple[int, ...]) -> None:
+    problem = kind_of("TooSharp")()
+    problem.static_parameters = declared
+    (advice,) = [each.advice for each in check(problem) if "lies beyond all" in each.seen]
+    assert ("static_parameters" in advice) == (not declared)
+
+
 RIGHT = [
     *registry.BUILT_IN,
     "light_dark_room:LightDarkRoom",

@@ -380,7 +380,7 @@ def _states(problem: Any, function: str, shape: tuple[int, ...], *arguments: obj
     if not _kernel.all_finite(states):
         rows = states.reshape(-1, shape[-1])
         bad = int(np.argmin(np.isfinite(rows).all(axis=-1)))
-        where = in_brief(rows[bad])
+        where = f"{in_brief(rows[bad])}: every coordinate must be finite"
         raise ProblemError(f"{function} of {name_of(problem)} put particle {bad} at {where}")
     states.setflags(write=False)
     return states

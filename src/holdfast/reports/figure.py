@@ -118,7 +118,8 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(_WIDTH if scene else 8.0, height), layout="constrained")
         FigureCanvasAgg(figure)
-        figure.suptitle(_title(configuration, record), x=0.012, ha="left", fontsize=12.0)
+        title = _title(configuration, record)
+        figure.suptitle(title, x=0.012, ha="left", fontsize=12.0, wrap=True)
         if scene:
             # A workspace as high as many panels would leave a gap between it and its legend.
             filled = min(height, _HIGHEST_WORKSPACE) / height

@@ -53,6 +53,7 @@ def require_rerun(target: ViewTarget) -> None:
     if target.viewer == "" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewError(
             "there is no display for Rerun's viewer (neither DISPLAY nor WAYLAND_DISPLAY is set): "
-            "write a file instead and open it elsewhere with rerun FILE, or name a viewer that "
-            "runs elsewhere by HOST:PORT (started there with rerun --bind 0.0.0.0)"
+            "write a file instead (view RUN --save FILE, run --view-file FILE) and open it "
+            "elsewhere with rerun FILE, or name a viewer that runs elsewhere (view RUN --viewer "
+            "HOST:PORT, run --view rerun=HOST:PORT; started there with rerun --bind 0.0.0.0)"
         )

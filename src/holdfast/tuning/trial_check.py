@@ -342,9 +342,8 @@ def _report_endings(inspection: Inspection, results: list[TrialResult], steps: i
         inspection.add("information", "trials", seen)
         return
     seen += f", within {steps} steps; with the state known most do"
-    advice = "The estimate (the mean) may lie where the robot is not, or random sensing is too "
-    advice += "poor. Try particle_filter.estimate: heaviest_mode, and sense more often "
-    advice += "(simulator.sensing_intervals)."
+    advice = "The estimate (the mean) may lie where the robot is not, or random sensing is poor. "
+    advice += "Try particle_filter.estimate: heaviest_mode, and fewer simulator.sensing_intervals."
     inspection.add("warning", "trials", seen, advice)
 
 
@@ -380,7 +379,9 @@ def _report_depletion(inspection: Inspection, trials: list[_Watcher]) -> None:
         seen += f"random sensing, the true state lies beyond all {particles} particles in some "
         seen += f"coordinate, most often in {inspection.coordinate(at)} ({shares[at]:.0%})"
         advice = "An observation of one coordinate leaves few particles for the others: take more, "
-        advice += "or sense more often. What does not move needs a little noise in move."
+        advice += "or sense more often."
+        if not attributes.static_parameters(inspection.problem):
+            advice += " Name continuous values that never change in static_parameters."
         inspection.add("warning", "depletion", seen, advice)
 
 
