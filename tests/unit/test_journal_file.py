@@ -19,10 +19,12 @@ class TestFinding:
 
     def test_what_is_no_run(self, tmp_path: Path) -> None:
         os.mkfifo(tmp_path / "pipe")
+        (tmp_path / "one").mkdir()
+        (tmp_path / "one" / "journal.bin").touch()
         # An end that stays open, so that a reader that waits would hang, not fail.
         held = os.open(tmp_path / "pipe", os.O_RDWR)
         for run, message in (
-            (tmp_path, "holds no journal.bin, so no run to compare"),
+            (tmp_path, "holds no journal.bin, so no run to compare; one of a sweep's is .*/one"),
             (tmp_path / "missing", "no such directory or journal, so no run to compare"),
             (Path("/dev/null"), "is a pipe or device"),
             (tmp_path / "pipe", "is a pipe or device"),

@@ -265,7 +265,9 @@ def find_journal(run: Path, purpose: str) -> Path:
         for name in (JOURNAL_NAME, OLD_JOURNAL_NAME):
             if (run / name).is_file():
                 return run / name
-        raise OutputError(f"{run}: holds no {JOURNAL_NAME}, so no run to {purpose}")
+        within = next(run.glob(f"*/{JOURNAL_NAME}"), None)
+        hint = f"; one of a sweep's is {within.parent}" if within else ""
+        raise OutputError(f"{run}: holds no {JOURNAL_NAME}, so no run to {purpose}{hint}")
     if not run.exists():
         raise OutputError(f"{run}: there is no such directory or journal, so no run to {purpose}")
     if not run.is_file():

@@ -342,8 +342,8 @@ def _report_endings(inspection: Inspection, results: list[TrialResult], steps: i
         inspection.add("information", "trials", seen)
         return
     seen += f", within {steps} steps; with the state known most do"
-    advice = "The estimate (the mean) may lie where the robot is not, or random sensing is poor. "
-    advice += "Try particle_filter.estimate: heaviest_mode, and fewer simulator.sensing_intervals."
+    advice = "The estimate (the mean) may lie where the robot is not, or random sensing is poor: "
+    advice += "try particle_filter.estimate: heaviest_mode, or shorter simulator.sensing_intervals."
     inspection.add("warning", "trials", seen, advice)
 
 
@@ -378,8 +378,7 @@ def _report_depletion(inspection: Inspection, trials: list[_Watcher]) -> None:
         seen = f"in {whole:.0%} of the beliefs before sensing, over {len(trials)} trials with "
         seen += f"random sensing, the true state lies beyond all {particles} particles in some "
         seen += f"coordinate, most often in {inspection.coordinate(at)} ({shares[at]:.0%})"
-        advice = "An observation of one coordinate leaves few particles for the others: take more, "
-        advice += "or sense more often."
+        advice = "An observation leaves few for other coordinates: take more, or sense more often."
         if not attributes.static_parameters(inspection.problem):
             advice += " Name continuous values that never change in static_parameters."
         inspection.add("warning", "depletion", seen, advice)

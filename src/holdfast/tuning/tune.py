@@ -246,7 +246,7 @@ class _Tuner:
         untried = sum(
             each.state == "set aside" and each.trials <= PILOT_TRIALS for each in standings
         )
-        sentence += _note(untried, "slow", "not tried: a larger budget does that")
+        sentence += _note(untried, "more", "not tried: a larger budget does that")
         open_ones = sum(
             each.state == "in the race" and each.candidate not in judged for each in standings
         )
