@@ -1,5 +1,6 @@
 """The codec: what goes in comes out, and what is no message is said to be none."""
 
+import contextlib
 import math
 import random
 import struct
@@ -234,18 +235,18 @@ def test_a_session_configuration_has_a_bounded_number_of_values(model: dict[str,
     refuse(encode(_request(model)), "too_large", f"more than {MAX_CONFIGURATION_VALUES} values")
 
 
-def _with_part(place: int, part: bytes) -> bytes:
+def _with_part(place: int, part: bytes, storm: bool = False) -> bytes:
     """Return a request of whose session configuration a part is these bytes.
 
-    Its digest is right if they can be decoded.
+    Its digest is right if they can be decoded, but for a storm, which that would take seconds.
     """
     opening = SessionConfiguration("peg_in_hole_2d", {}, {}, PlanningSettings(), 9)
     parts = [*map(msgspec.msgpack.encode, msgspec.structs.astuple(opening))]
     packed = replaced(parts, place, part)
-    try:
-        settings = settings_digest(unpack_configuration(packed))
-    except Exception:  # noqa: BLE001 - then it will not come to that
-        settings = b"s" * 16
+    settings = b"s" * 16
+    if not storm:
+        with contextlib.suppress(Exception):  # then it will not come to that
+            settings = settings_digest(unpack_configuration(packed))
     fields = [*msgspec.structs.astuple(REQUEST)[:8], (), packed, None, settings]
     return with_checksum(msgspec.msgpack.encode(fields))
 
@@ -281,7 +282,7 @@ def test_what_a_file_cannot_say_is_malformed_where_it_comes_in(value: bytes, wha
 @pytest.mark.parametrize("place", [1, 2], ids=["model", "state_space_planner"])
 def test_what_is_costly_to_make_is_refused_before_it_is_made(storm: str, place: int) -> None:
     """Sixteen thousand keys of the same hash held up a process for seconds."""
-    payload = _with_part(place, b"\x81\xa1a" + STORMS[storm])
+    payload = _with_part(place, b"\x81\xa1a" + STORMS[storm], storm=True)
     assert len(payload) < MAX_CONFIGURATION_BYTES
     tracemalloc.start()
     try:
