@@ -36,23 +36,28 @@ HOLDFAST_INLINE void put(std::uint8_t* out, std::size_t count, unsigned bits) {
     }
 }
 
+/// Which of eight discs are in collision.
+HOLDFAST_INLINE IntLanes discs_hit(const DiscShape& shape, const Lanes& x, const Lanes& y) {
+    IntLanes hits = splat_int(0);
+    for (std::size_t o = 0; o < shape.num_obstacles; ++o) {
+        const double* limits = shape.obstacles + 4 * o;
+        Lanes nearest_x, nearest_y, unused;
+        least_and_greatest(x, splat(limits[0]), unused, nearest_x);
+        least_and_greatest(nearest_x, splat(limits[2]), nearest_x, unused);
+        least_and_greatest(y, splat(limits[1]), unused, nearest_y);
+        least_and_greatest(nearest_y, splat(limits[3]), nearest_y, unused);
+        const Lanes dx = x - nearest_x, dy = y - nearest_y;
+        hits |= dx * dx + dy * dy < shape.radius_squared;
+    }
+    return hits;
+}
+
 static void discs_collide(const DiscShape& shape, const double* states, std::size_t count,
                           std::uint8_t* out) {
     for (std::size_t begin = 0; begin < count; begin += lane_count) {
         const Lanes x = coordinate(states, count, begin, 2, 0);
         const Lanes y = coordinate(states, count, begin, 2, 1);
-        unsigned hits = 0;
-        for (std::size_t o = 0; o < shape.num_obstacles && hits != 0xffu; ++o) {
-            const double* limits = shape.obstacles + 4 * o;
-            Lanes nearest_x, nearest_y, unused;
-            least_and_greatest(x, splat(limits[0]), unused, nearest_x);
-            least_and_greatest(nearest_x, splat(limits[2]), nearest_x, unused);
-            least_and_greatest(y, splat(limits[1]), unused, nearest_y);
-            least_and_greatest(nearest_y, splat(limits[3]), nearest_y, unused);
-            const Lanes dx = x - nearest_x, dy = y - nearest_y;
-            hits |= bits_of(dx * dx + dy * dy < shape.radius_squared);
-        }
-        put(out + begin, count - begin, hits);
+        put(out + begin, count - begin, bits_of(discs_hit(shape, x, y)));
     }
 }
 
