@@ -165,12 +165,12 @@ std::size_t draw_free_batch(const World& world, const Input<1>& mean,
 template <class World, class Policy>
 bool follow_batch(const World& world, const OwnedPolicy<Policy>& policy, const Input<2>& states,
                   std::size_t stage, const std::vector<std::uint32_t>& offsets, double tolerance,
-                  int threads, InPlace<double, 2> states_at, InPlace<std::int64_t, 1> stages_at) {
+                  int threads, InPlace<double, 3> states_at, InPlace<std::int64_t, 2> stages_at) {
     constexpr std::size_t d = World::dimension;
     const std::size_t count = states.shape(0);
-    require(states.shape(1) == d && states_at.shape(1) == d &&
-                states_at.shape(0) == count * offsets.size() &&
-                stages_at.shape(0) == count * offsets.size(),
+    require(states.shape(1) == d && states_at.shape(2) == d && states_at.shape(1) == count &&
+                states_at.shape(0) == offsets.size() && stages_at.shape(1) == count &&
+                stages_at.shape(0) == offsets.size(),
             "shapes differ");
     require(!offsets.empty() && std::is_sorted(offsets.begin(), offsets.end()),
             "the offsets are not in order");
@@ -178,7 +178,7 @@ bool follow_batch(const World& world, const OwnedPolicy<Policy>& policy, const I
     if (!all_finite(states.data(), count * d)) return false;
     WithoutInterpreter released;
     follow<World, Policy>(world, policy, count, states.data(), stage, offsets, tolerance, threads,
-           states_at.data(), stages_at.data());
+                          states_at.data(), stages_at.data());
     return true;
 }
 
@@ -210,12 +210,11 @@ bool roll_out_batch(
     }
     const auto& [interval, looks, steps, discount, price, counts_steps] = settings;
     WithoutInterpreter released;
-    roll_out<World, Policy>(
-        world, policy,
-             {actions, samples, members, true_states.data(), estimates.data(), clouds.data(), stage,
-              standard_deviation.data(), tolerance, interval, looks, steps, discount, price,
-              counts_steps},
-             to_stream(stream), threads, returns.data());
+    roll_out<World, Policy>(world, policy,
+                            {actions, samples, members, true_states.data(), estimates.data(),
+                             clouds.data(), stage, standard_deviation.data(), tolerance, interval,
+                             looks, steps, discount, price, counts_steps},
+                            to_stream(stream), threads, returns.data());
     return true;
 }
 
@@ -331,10 +330,9 @@ void holdfast::bind_geometry(nb::module_& module) {
         });
     using ViaPoints = OwnedPolicy<ViaPointPolicy>;
     nb::class_<ViaPoints>(module, "ViaPointPolicy")
-        .def("__init__", [](ViaPoints* self, const std::vector<std::array<double, 5>>& stages,
-                            double step_size) {
-            new (self) ViaPoints({step_size}, numbers_of(stages));
-        });
+        .def("__init__",
+             [](ViaPoints* self, const std::vector<std::array<double, 5>>& stages,
+                double step_size) { new (self) ViaPoints({step_size}, numbers_of(stages)); });
     define(module, "beliefs_without_truth", &beliefs_without_truth_batch);
     bind_way<DiscWorld, ViaPointPolicy>(disc);
     bind_way<RectangleWorld, PegPolicy2D>(rectangle);

@@ -77,10 +77,8 @@ void DiscWorld::collide_each(const double* states, std::size_t count, std::uint8
     vector_kernels().discs_collide(shape(), states, count, out);
 }
 
-void DiscWorld::clearances(const double* states, std::size_t stride, std::size_t count,
-                           double* out) const {
-    const RoundShape round{radius_, &obstacles_.data()->x_min, obstacles_.size()};
-    vector_kernels().clearances(round, states, stride, count, out);
+RoundShape DiscWorld::round() const {
+    return {radius_, &obstacles_.data()->x_min, obstacles_.size()};
 }
 
 DiscShape DiscWorld::shape() const {
@@ -159,10 +157,8 @@ void RectangleWorld::collide_each(const double* states, std::size_t count,
     vector_kernels().rectangles_collide(shape(), states, count, out);
 }
 
-void RectangleWorld::clearances(const double* states, std::size_t stride, std::size_t count,
-                                double* out) const {
-    const RoundShape round{bounding_radius_, &obstacles_.data()->x_min, obstacles_.size()};
-    vector_kernels().clearances(round, states, stride, count, out);
+RoundShape RectangleWorld::round() const {
+    return {bounding_radius_, &obstacles_.data()->x_min, obstacles_.size()};
 }
 
 RectangleShape RectangleWorld::shape() const {

@@ -115,21 +115,8 @@ void BoxWorld::collide_each(const double* states, std::size_t count, std::uint8_
     for (std::size_t n = 0; n < count; ++n) out[n] = collides(states + n * dimension) ? 1 : 0;
 }
 
-void BoxWorld::clearances(const double* states, std::size_t stride, std::size_t count,
-                          double* out) const {
-    for (std::size_t n = 0; n < count; ++n) {
-        const std::array<double, 3> at = {states[n], states[stride + n], states[2 * stride + n]};
-        double gap = std::numeric_limits<double>::infinity();
-        for (const AxisAlignedBox& box : obstacles_) {
-            double widest = -std::numeric_limits<double>::infinity();
-            for (std::size_t i = 0; i < 3; ++i) {
-                widest = std::max(widest, std::max(box.low[i] - at[i], at[i] - box.high[i]));
-            }
-            gap = std::min(gap, widest);
-        }
-        const double size = std::abs(at[0]) + std::abs(at[1]) + std::abs(at[2]);
-        out[n] = gap - bounding_radius_ - 1e-9 * (1.0 + bounding_radius_ + size);
-    }
+RoundShape BoxWorld::round() const {
+    return {bounding_radius_, obstacles_.data()->low.data(), obstacles_.size()};
 }
 
 }  // namespace holdfast

@@ -38,10 +38,7 @@ class BoxWorld {
     // The same for each of `count` states.
     void collide_each(const double* states, std::size_t count, std::uint8_t* out) const;
 
-    // How far each of the states may move along each axis, and turn as it likes, without a
-    // collision. Zero or less tells nothing. The states are as those of FreeWalk.
-    void clearances(const double* states, std::size_t stride, std::size_t count, double* out) const;
-
+    RoundShape round() const;
     Shape shape() const { return {}; }
 
   private:

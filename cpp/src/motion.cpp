@@ -5,6 +5,7 @@
 #include <atomic>
 #include <bit>
 #include <limits>
+#include <type_traits>
 #include <utility>
 
 #include "geometry_2d.hpp"
@@ -150,6 +151,7 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
     constexpr std::size_t d = World::dimension;
     static_assert(Policy::dimension == d);
     const auto& steps = kernels_of(vector_kernels(), policy);
+    const auto shape = world.shape();
     constexpr double cost_of_a_step = 20.0;
     const std::size_t num_blocks = (count + way_stride - 1) / way_stride;
     const double work =
@@ -160,15 +162,13 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
         const std::size_t end = std::min(first + way_stride, count);
         const std::size_t own = end - first;
         // Step by step through the block: eight particles side by side.
-        alignas(64) std::array<double, d * way_stride> state, action, next, asking_state;
-        alignas(64) std::array<double, way_stride> room, farthest, clearance;
+        alignas(64) std::array<double, d * way_stride> state, action, next;
+        alignas(64) std::array<double, way_stride> room;
         std::array<std::int64_t, way_stride> own_stage;
         std::array<std::array<double, d>, way_stride> tested;
         std::array<std::uint8_t, way_stride> collides;
-        std::array<std::size_t, way_stride> near, asking;
+        std::array<std::size_t, way_stride> near;
         std::array<double, way_stride> reached, blocked;  // fractions of the way
-        std::array<int, way_stride> steps_near{};
-        std::size_t num_near = 0;
         // Less than any step, also than one that only turns.
         constexpr double unknown = -1.0;
         room.fill(tolerance == 0.0 ? std::numeric_limits<double>::infinity() : unknown);
@@ -177,8 +177,8 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
             const double* from = states + (first + std::min(i, own - 1)) * d;
             for (std::size_t c = 0; c < d; ++c) state[c * way_stride + i] = from[c];
         }
-        const Way way{own,         state.data(),     action.data(), next.data(),
-                      own_stage.data(), room.data(), farthest.data()};
+        const Way way{own,         state.data(), action.data(), next.data(), own_stage.data(),
+                      room.data(), world.round()};
         std::uint32_t moving = ~std::uint32_t{0} >> (way_stride - own);
         const auto test = [&](std::size_t number) {
             if (number >= worth_testing_together) {
@@ -187,45 +187,17 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
             }
             for (std::size_t n = 0; n < number; ++n) collides[n] = world.collides(tested[n].data());
         };
-        // Finds those whose step can end in collision: none while the particle has moved less than
-        // it was away from the nearest obstacle.
-        const auto find_near = [&](std::uint32_t bits) {
-            num_near = 0;
-            std::size_t num_asking = 0;
-            for (; bits != 0; bits &= bits - 1) {
-                const auto i = static_cast<std::size_t>(std::countr_zero(bits));
-                // Who is near stays near for a while: not asked again at once.
-                if (steps_near[i] > 0) {
-                    --steps_near[i];
-                    near[num_near++] = i;
-                    continue;
-                }
-                for (std::size_t c = 0; c < d; ++c) {
-                    asking_state[c * way_stride + num_asking] = state[c * way_stride + i];
-                }
-                asking[num_asking++] = i;
-            }
-            if (num_asking > 0) {
-                world.clearances(asking_state.data(), way_stride, num_asking, clearance.data());
-            }
-            for (std::size_t n = 0; n < num_asking; ++n) {
-                const std::size_t i = asking[n];
-                if (clearance[n] > farthest[i]) {
-                    room[i] = clearance[n] - farthest[i];
-                    continue;
-                }
-                room[i] = unknown;
-                steps_near[i] = 3;
+        // Stops those that may collide, as `stop_at_contact` does, but all of them together.
+        const auto stop = [&](std::uint32_t hits) {
+            std::size_t left = 0, num_near = 0;
+            for (; hits != 0; hits &= hits - 1) {
+                const auto i = static_cast<std::size_t>(std::countr_zero(hits));
+                for (std::size_t c = 0; c < d; ++c) tested[num_near][c] = next[c * way_stride + i];
                 near[num_near++] = i;
             }
-            for (std::size_t n = 0; n < num_near; ++n) {
-                for (std::size_t c = 0; c < d; ++c) tested[n][c] = next[c * way_stride + near[n]];
-            }
-        };
-        // Those near obstacles, as `stop_at_contact` does, but all of them together.
-        const auto stop_near = [&] {
-            test(num_near);
-            std::size_t left = 0;
+            // Boxes have not been tested side by side.
+            collides.fill(1);
+            if constexpr (std::is_same_v<typename World::Shape, BoxShape>) test(num_near);
             for (std::size_t n = 0; n < num_near; ++n) {
                 if (collides[n] == 0) continue;
                 reached[near[n]] = 0.0;
@@ -241,7 +213,8 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
                                          fraction > reached[i] && fraction < blocked[i];
                     for (std::size_t c = 0; c < d; ++c) {
                         const std::size_t at = c * way_stride + i;
-                        const double to = state[at] + (goes_on ? fraction : reached[i]) * action[at];
+                        const double to =
+                            state[at] + (goes_on ? fraction : reached[i]) * action[at];
                         (goes_on ? tested[left][c] : next[at]) = to;
                     }
                     if (goes_on) near[left++] = i;
@@ -257,15 +230,13 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
         for (std::size_t k = 0; k < offsets.size(); ++k) {
             // Without noise, what stands still once does so for ever.
             for (; step < offsets[k] && moving != 0; ++step) {
-                if (const std::uint32_t bits = steps.act(policy, way) & moving; bits != 0) {
-                    find_near(bits);
-                    stop_near();
-                }
+                if (const auto hits = steps.act(policy, shape, way, moving); hits != 0) stop(hits);
                 moving = steps.arrive(policy, way, moving);
             }
             for (std::size_t i = 0; i < own; ++i) {
                 const std::size_t at = k * count + first + i;
-                for (std::size_t c = 0; c < d; ++c) states_at[at * d + c] = state[c * way_stride + i];
+                for (std::size_t c = 0; c < d; ++c)
+                    states_at[at * d + c] = state[c * way_stride + i];
                 stages_at[at] = own_stage[i];
             }
         }

@@ -182,7 +182,8 @@ class Samples {
     // Finds the first robot of the same sample that equals this one, if it is an earlier one.
     template <class Equal>
     const Robot* alike_of(const Robot& robot, Equal&& equal) const {
-        for (const Robot* other = &robots_[robot.sample * input_.actions]; other < &robot; ++other) {
+        for (const Robot* other = &robots_[robot.sample * input_.actions]; other < &robot;
+             ++other) {
             if (goes_on(*other) && equal(*other)) return other;
         }
         return nullptr;
@@ -224,9 +225,17 @@ class Samples {
 
     // What is earned from the step on by robots that know their state, without obstacles.
     void find_known_values(std::size_t from) {
-        FreeWalk way{walking_.stride(), 0,   walking_.data(),      walk_stages_.data(),
-                     walk_noise_.data(), walk_values_.data(), 1.0, 0.0,
-                     false,              input_.counts_steps, goals_.data()};
+        FreeWalk way{walking_.stride(),
+                     0,
+                     walking_.data(),
+                     walk_stages_.data(),
+                     walk_noise_.data(),
+                     walk_values_.data(),
+                     1.0,
+                     0.0,
+                     false,
+                     input_.counts_steps,
+                     goals_.data()};
         for (std::size_t step = from; step < input_.steps && !walkers_.empty(); ++step) {
             if ((step - from) % steps_of_long_work == 0) check_interruption();
             draw_free_noise(step);
@@ -279,7 +288,6 @@ class Samples {
     void draw() {
         if (asked_.empty()) return;
         constexpr std::size_t each = (d + 1) / 2;  // blocks with d draws from any first one on
-        static_assert(d % 2 == 0 || 2 * each == d + 1);
         drawn_.resize(asked_.size() * 2 * each);
         vector_kernels().normal_blocks(asked_.data(), firsts_.data(), asked_.size(), each,
                                        drawn_.data());
@@ -368,7 +376,8 @@ class Samples {
     // As `move` has it.
     void move(const StepStreams& streams) {
         pending_.clear();
-        world_.clearances(moving_.data(), moving_.stride(), movers_.size(), room_.data());
+        steps_.clearances(world_.round(), moving_.data(), moving_.stride(), movers_.size(),
+                          room_.data());
         for (std::size_t m = 0; m < movers_.size(); ++m) {
             Mover& own = movers_[m];
             own.way = greatest(*own.action);

@@ -101,7 +101,8 @@ struct RectangleShape {
 /// A box among boxes, whose collisions are tested one by one.
 struct BoxShape {};
 
-/// A body within a circle among rectangles, to ask how far it is from them.
+/// A body within a ball among boxes, to ask how far it is from them: of each the minima, then the
+/// maxima.
 struct RoundShape {
     double radius;
     const double* obstacles;
@@ -128,7 +129,8 @@ struct Way {
     std::size_t count;
     double *states, *actions, *next;
     std::int64_t* stages;
-    double *room, *farthest;  // how far obstacles are at least; how far the action goes
+    double* room;  // how far they may move along each axis; less than zero: to be found
+    RoundShape round;
 };
 
 /// What a policy says of many states.
@@ -141,9 +143,14 @@ struct PolicyKernels {
     void (*judge)(const Policy&, const Shape&, const double* states, const double* actions,
                   std::size_t stride, std::size_t count, double* rewards, std::uint8_t* goals);
     void (*walk)(const Policy&, const Shape&, const FreeWalk&);
-    /// The next actions, and where these lead. Returns, as bits, those that go farther than they
-    /// have room; the room of the others is less then.
-    std::uint32_t (*act)(const Policy&, const Way&);
+    /// How far each of the states may move along each axis, and turn as it likes, without a
+    /// collision. Zero or less tells nothing.
+    void (*clearances)(const RoundShape&, const double* states, std::size_t stride,
+                       std::size_t count, double* out);
+    /// The next actions of those in the bits `moving`, and where these lead. Returns, as bits,
+    /// those that can be in collision there; for a shape that is tested side by side, those that
+    /// are.
+    std::uint32_t (*act)(const Policy&, const Shape&, const Way&, std::uint32_t moving);
     /// Makes the next state of those in the bits `moving` their state, with its stage. Returns
     /// which of them have changed.
     std::uint32_t (*arrive)(const Policy&, const Way&, std::uint32_t moving);
@@ -156,7 +163,8 @@ struct VectorKernels {
     void (*sin)(const double* in, double* out, std::size_t count);
     void (*cos)(const double* in, double* out, std::size_t count);
     void (*normals)(const Stream&, std::uint64_t first, std::size_t count, double* out);
-    /// Both draws of `each` blocks from firsts[i] on of each of several streams: out[stream][2 each].
+    /// Both draws of `each` blocks from firsts[i] on of each of several streams: out[stream][2
+    /// each].
     void (*normal_blocks)(const Stream* streams, const std::uint32_t* firsts, std::size_t number,
                           std::size_t each, double* out);
     /// out[i] = substream numbers[i] of parents[i].
@@ -167,9 +175,6 @@ struct VectorKernels {
                           std::uint8_t* out);
     void (*rectangles_collide)(const RectangleShape&, const double* states, std::size_t count,
                                std::uint8_t* out);
-    /// Less than the gaps between circles and the nearest rectangle by more than rounding can make.
-    void (*clearances)(const RoundShape&, const double* states, std::size_t stride,
-                       std::size_t count, double* out);
     PolicyKernels<PegPolicy2D, RectangleShape> peg_2d;
     PolicyKernels<PegPolicy3D, BoxShape> peg_3d;
     PolicyKernels<ViaPointPolicy, DiscShape> via_points;
@@ -205,8 +210,12 @@ struct VectorKernels {
                         std::uint32_t* numbers, double* terms, double* gains);
 };
 
-inline const auto& kernels_of(const VectorKernels& all, const PegPolicy2D&) { return all.peg_2d; }
-inline const auto& kernels_of(const VectorKernels& all, const PegPolicy3D&) { return all.peg_3d; }
+inline const auto& kernels_of(const VectorKernels& all, const PegPolicy2D&) {
+    return all.peg_2d;
+}
+inline const auto& kernels_of(const VectorKernels& all, const PegPolicy3D&) {
+    return all.peg_3d;
+}
 inline const auto& kernels_of(const VectorKernels& all, const ViaPointPolicy&) {
     return all.via_points;
 }

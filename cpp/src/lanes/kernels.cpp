@@ -29,7 +29,6 @@ const VectorKernels table = {
     substreams,
     discs_collide,
     rectangles_collide,
-    clearances,
     steps_of<PegPolicy2D, RectangleShape>,
     steps_of<PegPolicy3D, BoxShape>,
     steps_of<ViaPointPolicy, DiscShape>,

@@ -73,9 +73,8 @@ HOLDFAST_INLINE void executed(const PegPolicy3D& policy, const StageLanes<PegPol
                               const Lanes (&state)[6], Lanes (&action)[6]) {
     const IntLanes near =
         square_root(state[0] * state[0] + state[1] * state[1]) < policy.half_width;
-    const IntLanes upright =
-        near & (square_root(state[3] * state[3] + state[4] * state[4] + state[5] * state[5]) <
-                policy.upright_limit);
+    const IntLanes upright = near & (square_root(state[3] * state[3] + state[4] * state[4] +
+                                                 state[5] * state[5]) < policy.upright_limit);
     const Lanes none = splat(0.0);
     action[0] = limited(-state[0], policy.limits[0]);
     action[1] = limited(-state[1], policy.limits[1]);
@@ -217,36 +216,46 @@ static void walk(const Policy& policy, const Shape& shape, const FreeWalk& way) 
         store_columns(way.states, way.stride, begin, state);
         Lanes value = load(way.values + begin);
         if (way.pays) value -= splat(way.price);
-        value += way.factor *
-                 (way.counts_steps ? splat(-1.0) : reward(policy, shape, state, action));
+        value +=
+            way.factor * (way.counts_steps ? splat(-1.0) : reward(policy, shape, state, action));
         store(way.values + begin, value);
         put(way.goals + begin, lane_count, bits_of(at_goal(policy, state)));
     }
 }
 
-template <class Policy>
-static std::uint32_t act(const Policy& policy, const Way& way) {
-    std::uint32_t near = 0;
+template <class Policy, class Shape>
+static std::uint32_t act(const Policy& policy, const Shape& shape, const Way& way,
+                         std::uint32_t moving) {
+    std::uint32_t hits = 0;
     for (std::size_t begin = 0; begin < way.count; begin += lane_count) {
         constexpr std::size_t d = Policy::dimension;
-        Lanes state[d], action[d];
+        const unsigned own = moving >> begin & 0xffu;
+        if (own == 0) continue;
+        Lanes state[d], action[d], next[d];
         load_columns(way.states, way_stride, begin, state);
         executed(policy, StageLanes<Policy>(policy, way.stages + begin), state, action);
         store_columns(way.actions, way_stride, begin, action);
+        for (std::size_t c = 0; c < d; ++c) next[c] = state[c] + action[c];
+        store_columns(way.next, way_stride, begin, next);
         Lanes farthest = size_of(action[0]);
         for (std::size_t c = 1; c < Policy::space_dimension; ++c) {
-            const Lanes own = size_of(action[c]);
-            farthest = select(farthest < own, own, farthest);
+            const Lanes other = size_of(action[c]);
+            farthest = select(farthest < other, other, farthest);
         }
-        const Lanes room = load(way.room + begin);
-        const IntLanes less = room < farthest;
-        store(way.room + begin, select(less, room, room - farthest));
-        store(way.farthest + begin, farthest);
-        near |= static_cast<std::uint32_t>(bits_of(less)) << begin;
-        for (std::size_t c = 0; c < d; ++c) state[c] = state[c] + action[c];
-        store_columns(way.next, way_stride, begin, state);
+        Lanes room = load(way.room + begin);
+        if ((bits_of(room < farthest) & own) == 0) {
+            store(way.room + begin, room - farthest);
+            continue;
+        }
+        room = clearance<Policy::space_dimension>(way.round, state);
+        const IntLanes near = room <= farthest;
+        // Who is near asks again, also after a step that only turns.
+        store(way.room + begin, select(near, splat(-1.0), room - farthest));
+        if (const unsigned bits = bits_of(near) & own; bits != 0) {
+            hits |= static_cast<std::uint32_t>(bits & bits_hit(shape, next)) << begin;
+        }
     }
-    return near;
+    return hits;
 }
 
 template <class Policy>
@@ -276,27 +285,20 @@ static std::uint32_t arrive(const Policy& policy, const Way& way, std::uint32_t 
     return still_moving;
 }
 
+template <class Policy>
 static void clearances(const RoundShape& shape, const double* states, std::size_t stride,
                        std::size_t count, double* out) {
     for (std::size_t begin = 0; begin < count; begin += lane_count) {
-        const Lanes x = load(states + begin), y = load(states + stride + begin);
-        Lanes gap = splat(__builtin_inf()), unused;
-        for (std::size_t o = 0; o < shape.num_obstacles; ++o) {
-            const double* limits = shape.obstacles + 4 * o;
-            Lanes beside, above, outside;
-            least_and_greatest(limits[0] - x, x - limits[2], unused, beside);
-            least_and_greatest(limits[1] - y, y - limits[3], unused, above);
-            least_and_greatest(beside, above, unused, outside);
-            least_and_greatest(gap, outside, gap, unused);
-        }
-        const Lanes error = 1e-9 * (1.0 + shape.radius + size_of(x) + size_of(y));
-        store(out + begin, gap - shape.radius - error);
+        Lanes state[Policy::dimension];
+        load_columns(states, stride, begin, state);
+        store(out + begin, clearance<Policy::space_dimension>(shape, state));
     }
 }
 
 template <class Policy, class Shape>
 constexpr PolicyKernels<Policy, Shape> steps_of{
-    decide<Policy>, judge<Policy, Shape>, walk<Policy, Shape>, act<Policy>, arrive<Policy>,
+    decide<Policy>,     judge<Policy, Shape>, walk<Policy, Shape>,
+    clearances<Policy>, act<Policy, Shape>,   arrive<Policy>,
 };
 
 }  // namespace holdfast::inline HOLDFAST_ISA
