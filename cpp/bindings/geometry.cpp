@@ -163,22 +163,22 @@ std::size_t draw_free_batch(const World& world, const Input<1>& mean,
 }
 
 template <class World, class Policy>
-bool follow_batch(const World& world, const Policy& policy, const Input<2>& states,
+bool follow_batch(const World& world, const OwnedPolicy<Policy>& policy, const Input<2>& states,
                   std::size_t stage, const std::vector<std::uint32_t>& offsets, double tolerance,
-                  int threads, InPlace<double, 2> states_at, InPlace<std::int64_t, 1> stages_at) {
+                  int threads, InPlace<double, 3> states_at, InPlace<std::int64_t, 2> stages_at) {
     constexpr std::size_t d = World::dimension;
     const std::size_t count = states.shape(0);
-    require(states.shape(1) == d && states_at.shape(1) == d &&
-                states_at.shape(0) == count * offsets.size() &&
-                stages_at.shape(0) == count * offsets.size(),
+    require(states.shape(1) == d && states_at.shape(2) == d && states_at.shape(1) == count &&
+                states_at.shape(0) == offsets.size() && stages_at.shape(1) == count &&
+                stages_at.shape(0) == offsets.size(),
             "shapes differ");
     require(!offsets.empty() && std::is_sorted(offsets.begin(), offsets.end()),
             "the offsets are not in order");
-    require(stage < policy.num_stages(), "there is no such stage");
+    require(stage < policy.num_stages, "there is no such stage");
     if (!all_finite(states.data(), count * d)) return false;
     WithoutInterpreter released;
-    follow(world, policy, count, states.data(), stage, offsets, tolerance, threads,
-           states_at.data(), stages_at.data());
+    follow<World, Policy>(world, policy, count, states.data(), stage, offsets, tolerance, threads,
+                          states_at.data(), stages_at.data());
     return true;
 }
 
@@ -187,7 +187,7 @@ using RolloutSettings = std::tuple<std::size_t, std::size_t, std::size_t, double
 
 template <class World, class Policy>
 bool roll_out_batch(
-    const World& world, const Policy& policy, const Input<2>& true_states,
+    const World& world, const OwnedPolicy<Policy>& policy, const Input<2>& true_states,
     const Input<3>& estimates,
     const nb::ndarray<const double, nb::ndim<4>, nb::c_contig, nb::device::cpu>& clouds,
     std::size_t stage, const Input<1>& standard_deviation, double tolerance,
@@ -202,7 +202,7 @@ bool roll_out_batch(
                 clouds.shape(1) == samples && clouds.shape(3) == d && members > 0 &&
                 standard_deviation.shape(0) == d,
             "shapes differ");
-    require(stage < policy.num_stages(), "there is no such stage");
+    require(stage < policy.num_stages, "there is no such stage");
     if (!all_finite(true_states.data(), true_states.size()) ||
         !all_finite(estimates.data(), estimates.size()) ||
         !all_finite(clouds.data(), clouds.size())) {
@@ -210,11 +210,11 @@ bool roll_out_batch(
     }
     const auto& [interval, looks, steps, discount, price, counts_steps] = settings;
     WithoutInterpreter released;
-    roll_out(world, policy,
-             {actions, samples, members, true_states.data(), estimates.data(), clouds.data(), stage,
-              standard_deviation.data(), tolerance, interval, looks, steps, discount, price,
-              counts_steps},
-             to_stream(stream), threads, returns.data());
+    roll_out<World, Policy>(world, policy,
+                            {actions, samples, members, true_states.data(), estimates.data(),
+                             clouds.data(), stage, standard_deviation.data(), tolerance, interval,
+                             looks, steps, discount, price, counts_steps},
+                            to_stream(stream), threads, returns.data());
     return true;
 }
 
@@ -256,6 +256,15 @@ void bind_way(nb::class_<World>& world) {
               nb::arg("standard_deviation").noconvert(), nb::arg("tolerance"), nb::arg("stream"),
               nb::arg("rollouts"), nb::arg("threads"), nb::arg("returns").noconvert(),
               nb::call_guard<StandardRounding>());
+}
+
+/// The numbers of a policy's stages, one after the other.
+template <std::size_t size>
+std::vector<double> numbers_of(const std::vector<std::array<double, size>>& stages) {
+    require(!stages.empty(), "a policy has a stage");
+    std::vector<double> numbers;
+    for (const auto& stage : stages) numbers.insert(numbers.end(), stage.begin(), stage.end());
+    return numbers;
 }
 
 template <class World>
@@ -301,31 +310,29 @@ void holdfast::bind_geometry(nb::module_& module) {
         },
         nb::arg("size_x"), nb::arg("size_y"), nb::arg("size_z"), nb::arg("obstacles").noconvert());
 
-    nb::class_<PegPolicy2D>(module, "PegPolicy2D")
-        .def("__init__", [](PegPolicy2D* self, const std::vector<std::array<double, 3>>& stages,
+    using Peg2D = OwnedPolicy<PegPolicy2D>;
+    nb::class_<Peg2D>(module, "PegPolicy2D")
+        .def("__init__", [](Peg2D* self, const std::vector<std::array<double, 3>>& stages,
                             double half_width, double height, const std::array<double, 3>& limits,
                             const std::array<double, 4>& goal) {
-            require(!stages.empty(), "a policy has a stage");
             const auto [axis, tolerance, above, below] = goal;
-            new (self) PegPolicy2D{{}, half_width, height, limits, {axis, tolerance, above, below}};
-            for (const auto& [hole, upright_limit, passed_below] : stages) {
-                self->stages.push_back({hole, upright_limit, passed_below});
-            }
+            PegPolicy2D policy{half_width, height, {}, {axis, tolerance, above, below}};
+            std::copy(limits.begin(), limits.end(), policy.limits);
+            new (self) Peg2D(policy, numbers_of(stages));
         });
-    nb::class_<PegPolicy3D>(module, "PegPolicy3D")
-        .def("__init__", [](PegPolicy3D* self, double half_width, double upright_limit,
+    using Peg3D = OwnedPolicy<PegPolicy3D>;
+    nb::class_<Peg3D>(module, "PegPolicy3D")
+        .def("__init__", [](Peg3D* self, double half_width, double upright_limit,
                             const std::array<double, 6>& limits, double goal_tolerance) {
-            new (self) PegPolicy3D{half_width, upright_limit, limits, goal_tolerance};
+            PegPolicy3D policy{half_width, upright_limit, {}, goal_tolerance};
+            std::copy(limits.begin(), limits.end(), policy.limits);
+            new (self) Peg3D(policy, {});
         });
-    nb::class_<ViaPointPolicy>(module, "ViaPointPolicy")
-        .def("__init__", [](ViaPointPolicy* self, const std::vector<std::array<double, 5>>& stages,
-                            double step_size) {
-            require(!stages.empty(), "a policy has a stage");
-            new (self) ViaPointPolicy(step_size);
-            for (const auto& [x, y, gain_x, gain_y, squared_radius] : stages) {
-                self->stages.push_back({{x, y}, {gain_x, gain_y}, squared_radius});
-            }
-        });
+    using ViaPoints = OwnedPolicy<ViaPointPolicy>;
+    nb::class_<ViaPoints>(module, "ViaPointPolicy")
+        .def("__init__",
+             [](ViaPoints* self, const std::vector<std::array<double, 5>>& stages,
+                double step_size) { new (self) ViaPoints({step_size}, numbers_of(stages)); });
     define(module, "beliefs_without_truth", &beliefs_without_truth_batch);
     bind_way<DiscWorld, ViaPointPolicy>(disc);
     bind_way<RectangleWorld, PegPolicy2D>(rectangle);

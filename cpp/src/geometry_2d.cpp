@@ -2,28 +2,13 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 #include <utility>
 
 #include "deterministic_math.hpp"
-#include "vector_kernels.hpp"
 
 namespace holdfast {
 
 namespace {
-
-// Less than the gap between a circle and the nearest rectangle by more than rounding can make.
-double gap_around(const double* state, double radius,
-                  const std::vector<AxisAlignedRectangle>& obstacles) {
-    const double x = state[0], y = state[1];
-    double gap = std::numeric_limits<double>::infinity();
-    for (const AxisAlignedRectangle& obstacle : obstacles) {
-        const double beside = std::max(obstacle.x_min - x, x - obstacle.x_max);
-        const double above = std::max(obstacle.y_min - y, y - obstacle.y_max);
-        gap = std::min(gap, std::max(beside, above));
-    }
-    return gap - radius - 1e-9 * (1.0 + radius + std::abs(x) + std::abs(y));
-}
 
 constexpr double pi = 3.14159265358979323846;
 
@@ -89,12 +74,15 @@ bool DiscWorld::collides(const double* state) const {
 }
 
 void DiscWorld::collide_each(const double* states, std::size_t count, std::uint8_t* out) const {
-    const DiscShape shape{radius_squared_, &obstacles_.data()->x_min, obstacles_.size()};
-    vector_kernels().discs_collide(shape, states, count, out);
+    vector_kernels().discs_collide(shape(), states, count, out);
 }
 
-double DiscWorld::clearance(const double* state) const {
-    return gap_around(state, radius_, obstacles_);
+RoundShape DiscWorld::round() const {
+    return {radius_, &obstacles_.data()->x_min, obstacles_.size()};
+}
+
+DiscShape DiscWorld::shape() const {
+    return {radius_squared_, &obstacles_.data()->x_min, obstacles_.size()};
 }
 
 RectangleWorld::RectangleWorld(double width, double height,
@@ -166,13 +154,16 @@ bool RectangleWorld::collides(const double* state) const {
 
 void RectangleWorld::collide_each(const double* states, std::size_t count,
                                   std::uint8_t* out) const {
-    const RectangleShape shape{half_width_, half_height_, bounding_radius_,
-                               &obstacles_.data()->x_min, obstacles_.size()};
-    vector_kernels().rectangles_collide(shape, states, count, out);
+    vector_kernels().rectangles_collide(shape(), states, count, out);
 }
 
-double RectangleWorld::clearance(const double* state) const {
-    return gap_around(state, bounding_radius_, obstacles_);
+RoundShape RectangleWorld::round() const {
+    return {bounding_radius_, &obstacles_.data()->x_min, obstacles_.size()};
+}
+
+RectangleShape RectangleWorld::shape() const {
+    return {half_width_, half_height_, bounding_radius_, &obstacles_.data()->x_min,
+            obstacles_.size()};
 }
 
 }  // namespace holdfast

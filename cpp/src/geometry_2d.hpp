@@ -17,6 +17,8 @@
 #include <cstdint>
 #include <vector>
 
+#include "vector_kernels.hpp"
+
 namespace holdfast {
 
 struct AxisAlignedRectangle {
@@ -27,6 +29,7 @@ struct AxisAlignedRectangle {
 class DiscWorld {
   public:
     static constexpr std::size_t dimension = 2, space_dimension = 2;
+    using Shape = DiscShape;
 
     DiscWorld(double radius, std::vector<AxisAlignedRectangle> obstacles);
 
@@ -37,9 +40,8 @@ class DiscWorld {
     // The same for each of `count` states.
     void collide_each(const double* states, std::size_t count, std::uint8_t* out) const;
 
-    // How far the state may move along each axis, and turn as it likes, without a collision. Zero
-    // or less tells nothing.
-    double clearance(const double* state) const;
+    RoundShape round() const;
+    Shape shape() const;
 
   private:
     double radius_, radius_squared_;
@@ -50,6 +52,7 @@ class DiscWorld {
 class RectangleWorld {
   public:
     static constexpr std::size_t dimension = 3, space_dimension = 2;
+    using Shape = RectangleShape;
 
     RectangleWorld(double width, double height, std::vector<AxisAlignedRectangle> obstacles);
 
@@ -60,9 +63,8 @@ class RectangleWorld {
     // The same for each of `count` states.
     void collide_each(const double* states, std::size_t count, std::uint8_t* out) const;
 
-    // How far the state may move along each axis, and turn as it likes, without a collision. Zero
-    // or less tells nothing.
-    double clearance(const double* state) const;
+    RoundShape round() const;
+    Shape shape() const;
 
   private:
     double half_width_, half_height_;

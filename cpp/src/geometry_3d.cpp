@@ -115,17 +115,8 @@ void BoxWorld::collide_each(const double* states, std::size_t count, std::uint8_
     for (std::size_t n = 0; n < count; ++n) out[n] = collides(states + n * dimension) ? 1 : 0;
 }
 
-double BoxWorld::clearance(const double* state) const {
-    double gap = std::numeric_limits<double>::infinity();
-    for (const AxisAlignedBox& box : obstacles_) {
-        double widest = -std::numeric_limits<double>::infinity();
-        for (std::size_t i = 0; i < 3; ++i) {
-            widest = std::max(widest, std::max(box.low[i] - state[i], state[i] - box.high[i]));
-        }
-        gap = std::min(gap, widest);
-    }
-    const double size = std::abs(state[0]) + std::abs(state[1]) + std::abs(state[2]);
-    return gap - bounding_radius_ - 1e-9 * (1.0 + bounding_radius_ + size);
+RoundShape BoxWorld::round() const {
+    return {bounding_radius_, obstacles_.data()->low.data(), obstacles_.size()};
 }
 
 }  // namespace holdfast

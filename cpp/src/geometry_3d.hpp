@@ -15,6 +15,8 @@
 #include <cstdint>
 #include <vector>
 
+#include "vector_kernels.hpp"
+
 namespace holdfast {
 
 struct AxisAlignedBox {
@@ -25,6 +27,7 @@ struct AxisAlignedBox {
 class BoxWorld {
   public:
     static constexpr std::size_t dimension = 6, space_dimension = 3;
+    using Shape = BoxShape;
 
     BoxWorld(const std::array<double, 3>& size, std::vector<AxisAlignedBox> obstacles);
 
@@ -35,9 +38,8 @@ class BoxWorld {
     // The same for each of `count` states.
     void collide_each(const double* states, std::size_t count, std::uint8_t* out) const;
 
-    // How far the state may move along each axis, and turn as it likes, without a collision. Zero
-    // or less tells nothing.
-    double clearance(const double* state) const;
+    RoundShape round() const;
+    Shape shape() const { return {}; }
 
   private:
     std::array<double, 3> half_size_;

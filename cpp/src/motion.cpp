@@ -3,7 +3,9 @@
 #include <algorithm>
 #include <array>
 #include <atomic>
-#include <cmath>
+#include <bit>
+#include <limits>
+#include <type_traits>
 #include <utility>
 
 #include "geometry_2d.hpp"
@@ -17,7 +19,6 @@ namespace {
 // Particles are worked on in blocks: large enough that the first draw of noise is one call, small
 // enough that its numbers stay on the stack and in the cache.
 constexpr std::size_t block_size = 128;
-constexpr std::size_t way_block_size = 32;
 
 // States whose collisions are tested faster eight at a time than one by one.
 constexpr std::size_t worth_testing_together = 4;
@@ -66,46 +67,6 @@ std::size_t add_noise(const World& world, std::size_t first, std::size_t count,
     }
     return num_pending;
 }
-
-// Tells which steps of a way can end in collision: none while the particle has moved less than it
-// was away from the nearest obstacle.
-template <class World>
-class Contact {
-  public:
-    explicit Contact(double tolerance) : steps_near_{}, none_(tolerance == 0.0) {
-        room_.fill(unknown);
-    }
-
-    bool stops(const World& world, std::size_t i, const double* state, const double* action) {
-        if (none_) return false;
-        double farthest = 0.0;
-        for (std::size_t c = 0; c < World::space_dimension; ++c) {
-            farthest = std::max(farthest, std::abs(action[c]));
-        }
-        if (room_[i] < farthest) {
-            // Who is near stays near for a while: not asked again at once.
-            if (steps_near_[i] > 0) {
-                --steps_near_[i];
-                return true;
-            }
-            room_[i] = world.clearance(state);
-            if (room_[i] <= farthest) {
-                room_[i] = unknown;
-                steps_near_[i] = 3;
-                return true;
-            }
-        }
-        room_[i] -= farthest;
-        return false;
-    }
-
-  private:
-    static constexpr double unknown = -1.0;  // less than any step, also than one that only turns
-
-    std::array<double, way_block_size> room_;
-    std::array<int, way_block_size> steps_near_;
-    bool none_;
-};
 
 // Moves the block of `count` states of which the first is particle `first`.
 template <class World>
@@ -189,28 +150,36 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
             int threads, double* states_at, std::int64_t* stages_at) {
     constexpr std::size_t d = World::dimension;
     static_assert(Policy::dimension == d);
+    const auto& steps = kernels_of(vector_kernels(), policy);
+    const auto shape = world.shape();
     constexpr double cost_of_a_step = 20.0;
-    const std::size_t num_blocks = (count + way_block_size - 1) / way_block_size;
+    const std::size_t num_blocks = (count + way_stride - 1) / way_stride;
     const double work =
         cost_of_a_step * static_cast<double>(count) * static_cast<double>(offsets.back());
 
     parallel_for(num_blocks, threads_for(work, num_blocks, threads), [&](std::size_t block) {
-        const std::size_t first = block * way_block_size;
-        const std::size_t end = std::min(first + way_block_size, count);
-        // Step by step through the block: a step of one particle waits for its last one, but not
-        // for the other particles'.
-        std::array<std::array<double, d>, way_block_size> state, next, action;
-        std::array<std::array<double, d>, way_block_size> tested;
-        std::array<std::uint8_t, way_block_size> collides;
-        std::array<std::size_t, way_block_size> own_stage, moving, near;
-        std::array<double, way_block_size> reached, blocked;  // fractions of the way
-        std::size_t num_moving = end - first, num_near = 0;
-        Contact<World> contact(tolerance);
-        for (std::size_t i = 0; i < end - first; ++i) {
-            std::copy(states + (first + i) * d, states + (first + i + 1) * d, state[i].begin());
-            own_stage[i] = stage;
-            moving[i] = i;
+        const std::size_t first = block * way_stride;
+        const std::size_t end = std::min(first + way_stride, count);
+        const std::size_t own = end - first;
+        // Step by step through the block: eight particles side by side.
+        alignas(64) std::array<double, d * way_stride> state, action, next;
+        alignas(64) std::array<double, way_stride> room;
+        std::array<std::int64_t, way_stride> own_stage;
+        std::array<std::array<double, d>, way_stride> tested;
+        std::array<std::uint8_t, way_stride> collides;
+        std::array<std::size_t, way_stride> near;
+        std::array<double, way_stride> reached, blocked;  // fractions of the way
+        // Less than any step, also than one that only turns.
+        constexpr double unknown = -1.0;
+        room.fill(tolerance == 0.0 ? std::numeric_limits<double>::infinity() : unknown);
+        own_stage.fill(static_cast<std::int64_t>(stage));
+        for (std::size_t i = 0; i < way_stride; ++i) {
+            const double* from = states + (first + std::min(i, own - 1)) * d;
+            for (std::size_t c = 0; c < d; ++c) state[c * way_stride + i] = from[c];
         }
+        const Way way{own,         state.data(), action.data(), next.data(), own_stage.data(),
+                      room.data(), world.round()};
+        std::uint32_t moving = ~std::uint32_t{0} >> (way_stride - own);
         const auto test = [&](std::size_t number) {
             if (number >= worth_testing_together) {
                 world.collide_each(tested[0].data(), number, collides.data());
@@ -218,10 +187,17 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
             }
             for (std::size_t n = 0; n < number; ++n) collides[n] = world.collides(tested[n].data());
         };
-        // Those near obstacles, as `stop_at_contact` does, but all of them together.
-        const auto stop_near = [&] {
-            test(num_near);
-            std::size_t left = 0;
+        // Stops those that may collide, as `stop_at_contact` does, but all of them together.
+        const auto stop = [&](std::uint32_t hits) {
+            std::size_t left = 0, num_near = 0;
+            for (; hits != 0; hits &= hits - 1) {
+                const auto i = static_cast<std::size_t>(std::countr_zero(hits));
+                for (std::size_t c = 0; c < d; ++c) tested[num_near][c] = next[c * way_stride + i];
+                near[num_near++] = i;
+            }
+            // Boxes have not been tested side by side.
+            collides.fill(1);
+            if constexpr (std::is_same_v<typename World::Shape, BoxShape>) test(num_near);
             for (std::size_t n = 0; n < num_near; ++n) {
                 if (collides[n] == 0) continue;
                 reached[near[n]] = 0.0;
@@ -235,9 +211,11 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
                     const double fraction = 0.5 * (reached[i] + blocked[i]);
                     const bool goes_on = blocked[i] - reached[i] > tolerance &&
                                          fraction > reached[i] && fraction < blocked[i];
-                    auto& to = goes_on ? tested[left] : next[i];
                     for (std::size_t c = 0; c < d; ++c) {
-                        to[c] = state[i][c] + (goes_on ? fraction : reached[i]) * action[i][c];
+                        const std::size_t at = c * way_stride + i;
+                        const double to =
+                            state[at] + (goes_on ? fraction : reached[i]) * action[at];
+                        (goes_on ? tested[left][c] : next[at]) = to;
                     }
                     if (goes_on) near[left++] = i;
                 }
@@ -250,34 +228,16 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
         };
         std::uint32_t step = 0;
         for (std::size_t k = 0; k < offsets.size(); ++k) {
-            for (; step < offsets[k] && num_moving > 0; ++step) {
-                std::size_t still_moving = 0;
-                num_near = 0;
-                for (std::size_t m = 0; m < num_moving; ++m) {
-                    const std::size_t i = moving[m];
-                    policy.executed(state[i].data(), own_stage[i], action[i].data());
-                    for (std::size_t c = 0; c < d; ++c) next[i][c] = state[i][c] + action[i][c];
-                    if (contact.stops(world, i, state[i].data(), action[i].data())) {
-                        tested[num_near] = next[i];
-                        near[num_near++] = i;
-                    }
-                }
-                stop_near();
-                for (std::size_t m = 0; m < num_moving; ++m) {
-                    const std::size_t i = moving[m];
-                    const std::size_t next_stage = policy.next_stage(next[i].data(), own_stage[i]);
-                    // Without noise, what stands still once does so for ever.
-                    moving[still_moving] = i;
-                    still_moving += next[i] != state[i] || next_stage != own_stage[i] ? 1 : 0;
-                    state[i] = next[i];
-                    own_stage[i] = next_stage;
-                }
-                num_moving = still_moving;
+            // Without noise, what stands still once does so for ever.
+            for (; step < offsets[k] && moving != 0; ++step) {
+                if (const auto hits = steps.act(policy, shape, way, moving); hits != 0) stop(hits);
+                moving = steps.arrive(policy, way, moving);
             }
-            for (std::size_t i = 0; i < end - first; ++i) {
+            for (std::size_t i = 0; i < own; ++i) {
                 const std::size_t at = k * count + first + i;
-                std::copy(state[i].begin(), state[i].end(), states_at + at * d);
-                stages_at[at] = static_cast<std::int64_t>(own_stage[i]);
+                for (std::size_t c = 0; c < d; ++c)
+                    states_at[at * d + c] = state[c * way_stride + i];
+                stages_at[at] = own_stage[i];
             }
         }
     });

@@ -11,6 +11,7 @@
 
 #include "philox.hpp"
 #include "point_tree.hpp"
+#include "policies.hpp"
 
 namespace holdfast {
 
@@ -97,6 +98,64 @@ struct RectangleShape {
     std::size_t num_obstacles;
 };
 
+/// A box among boxes, whose collisions are tested one by one.
+struct BoxShape {};
+
+/// A body within a ball among boxes, to ask how far it is from them: of each the minima, then the
+/// maxima.
+struct RoundShape {
+    double radius;
+    const double* obstacles;
+    std::size_t num_obstacles;
+};
+
+/// States whose policies are followed side by side without obstacles, for one step with noise.
+/// Here and below coordinate c of state i is at [c * stride + i], and arrays have room for a
+/// multiple of eight, with any valid stage where there is no state.
+struct FreeWalk {
+    std::size_t stride, count;
+    double* states;
+    std::int64_t* stages;
+    const double* noise;
+    double* values;
+    double factor, price;  // of the reward; subtracted from the value if it `pays`
+    bool pays, counts_steps;
+    std::uint8_t* goals;  // whether the goal is reached
+};
+
+/// States that are followed without noise, at most way_stride, with which as the stride.
+inline constexpr std::size_t way_stride = 32;
+struct Way {
+    std::size_t count;
+    double *states, *actions, *next;
+    std::int64_t* stages;
+    double* room;  // how far they may move along each axis; less than zero: to be found
+    RoundShape round;
+};
+
+/// What a policy says of many states.
+template <class Policy, class Shape>
+struct PolicyKernels {
+    /// The stages that follow, and the actions executed in them.
+    void (*decide)(const Policy&, const double* states, std::size_t stride, std::size_t count,
+                   std::int64_t* stages, double* actions);
+    /// The rewards, unless null, of actions that led to the states, and whether these are goals.
+    void (*judge)(const Policy&, const Shape&, const double* states, const double* actions,
+                  std::size_t stride, std::size_t count, double* rewards, std::uint8_t* goals);
+    void (*walk)(const Policy&, const Shape&, const FreeWalk&);
+    /// How far each of the states may move along each axis, and turn as it likes, without a
+    /// collision. Zero or less tells nothing.
+    void (*clearances)(const RoundShape&, const double* states, std::size_t stride,
+                       std::size_t count, double* out);
+    /// The next actions of those in the bits `moving`, and where these lead. Returns, as bits,
+    /// those that can be in collision there; for a shape that is tested side by side, those that
+    /// are.
+    std::uint32_t (*act)(const Policy&, const Shape&, const Way&, std::uint32_t moving);
+    /// Makes the next state of those in the bits `moving` their state, with its stage. Returns
+    /// which of them have changed.
+    std::uint32_t (*arrive)(const Policy&, const Way&, std::uint32_t moving);
+};
+
 struct VectorKernels {
     const char* name;
     void (*exp)(const double* in, double* out, std::size_t count);
@@ -104,9 +163,10 @@ struct VectorKernels {
     void (*sin)(const double* in, double* out, std::size_t count);
     void (*cos)(const double* in, double* out, std::size_t count);
     void (*normals)(const Stream&, std::uint64_t first, std::size_t count, double* out);
-    /// Draws firsts[i], ..., firsts[i] + count - 1 of each of several streams: out[stream][count].
-    void (*normals_of_each)(const Stream* streams, const std::uint64_t* firsts, std::size_t number,
-                            std::size_t count, double* out);
+    /// Both draws of `each` blocks from firsts[i] on of each of several streams: out[stream][2
+    /// each].
+    void (*normal_blocks)(const Stream* streams, const std::uint32_t* firsts, std::size_t number,
+                          std::size_t each, double* out);
     /// out[i] = substream numbers[i] of parents[i].
     void (*substreams)(const Stream* parents, const std::uint32_t* numbers, std::size_t count,
                        Stream* out);
@@ -115,6 +175,9 @@ struct VectorKernels {
                           std::uint8_t* out);
     void (*rectangles_collide)(const RectangleShape&, const double* states, std::size_t count,
                                std::uint8_t* out);
+    PolicyKernels<PegPolicy2D, RectangleShape> peg_2d;
+    PolicyKernels<PegPolicy3D, BoxShape> peg_3d;
+    PolicyKernels<ViaPointPolicy, DiscShape> via_points;
     double (*sum)(const double* in, std::size_t count);
     /// Sum of weights[i] * in[i], in the order of `sum`, as each of the next.
     double (*weighted_sum)(const double* weights, const double* in, std::size_t count);
@@ -146,6 +209,16 @@ struct VectorKernels {
     void (*prior_block)(const PriorGroup&, std::size_t begin, std::size_t end, double* scratch,
                         std::uint32_t* numbers, double* terms, double* gains);
 };
+
+inline const auto& kernels_of(const VectorKernels& all, const PegPolicy2D&) {
+    return all.peg_2d;
+}
+inline const auto& kernels_of(const VectorKernels& all, const PegPolicy3D&) {
+    return all.peg_3d;
+}
+inline const auto& kernels_of(const VectorKernels& all, const ViaPointPolicy&) {
+    return all.via_points;
+}
 
 /// The best of the compiled sets that this processor runs; HOLDFAST_SIMD names another one.
 const VectorKernels& vector_kernels();

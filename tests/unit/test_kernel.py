@@ -24,8 +24,12 @@ WORKLOAD = """
 import hashlib, json
 import numpy as np
 from holdfast import _kernel as kernel
-from holdfast.numerics.geometry import BoxWorld, DiscWorld, RectangleWorld
+from holdfast.numerics.geometry import BoxWorld, DiscWorld, RectangleWorld, RolloutSettings
 from holdfast.numerics.randomness import Stream
+from holdfast.problems.capsule_robot import CapsuleRobot
+from holdfast.problems.multitier_peg_in_hole_2d import MultitierPegInHole2D
+from holdfast.problems.peg_in_hole_2d import PegInHole2D
+from holdfast.problems.peg_in_hole_3d import PegInHole3D
 
 words = (7, 0, 3, 2, 1)
 stream = Stream(words)
@@ -138,6 +142,16 @@ for world, size in ((DiscWorld(0.4, flat), 2), (RectangleWorld(0.6, 1.4, flat), 
     states = states[~world.collides(states)]
     note(type(world).__name__,
          world.move(states, -states, deviation[:size], 1e-3, stream.substream(9)))
+
+for problem in (PegInHole2D(), MultitierPegInHole2D(), PegInHole3D(), CapsuleRobot()):
+    states = problem.initial_states(stream.substream(10), 99)
+    for stage in range(problem.num_stages):
+        note(f"way {problem.name} {stage}", *problem.expected_path(states, stage, (0, 9, 99), 2))
+        for counts_steps in (False, True):
+            note(f"rollouts {problem.name} {stage} {counts_steps}", problem.rollout_returns(
+                states[:21], np.stack([states[i:21 + i] for i in (0, 9, 9)]),
+                np.stack([states[i:42 + i].reshape(21, 2, -1) for i in (9, 57, 57)]), stage,
+                stream.substream(11), RolloutSettings(9, 8, 200, 0.99, 0.5, counts_steps), 2))
 print(json.dumps({"simd": kernel.simd(), "threads": kernel.threads_started(),
                   "wrong_ways": wrong_ways, "hashes": hashes}))
 """

@@ -36,58 +36,100 @@ HOLDFAST_INLINE void put(std::uint8_t* out, std::size_t count, unsigned bits) {
     }
 }
 
+/// Which of eight discs are in collision.
+HOLDFAST_INLINE IntLanes discs_hit(const DiscShape& shape, const Lanes& x, const Lanes& y) {
+    IntLanes hits = splat_int(0);
+    for (std::size_t o = 0; o < shape.num_obstacles; ++o) {
+        const double* limits = shape.obstacles + 4 * o;
+        Lanes nearest_x, nearest_y, unused;
+        least_and_greatest(x, splat(limits[0]), unused, nearest_x);
+        least_and_greatest(nearest_x, splat(limits[2]), nearest_x, unused);
+        least_and_greatest(y, splat(limits[1]), unused, nearest_y);
+        least_and_greatest(nearest_y, splat(limits[3]), nearest_y, unused);
+        const Lanes dx = x - nearest_x, dy = y - nearest_y;
+        hits |= dx * dx + dy * dy < shape.radius_squared;
+    }
+    return hits;
+}
+
 static void discs_collide(const DiscShape& shape, const double* states, std::size_t count,
                           std::uint8_t* out) {
     for (std::size_t begin = 0; begin < count; begin += lane_count) {
         const Lanes x = coordinate(states, count, begin, 2, 0);
         const Lanes y = coordinate(states, count, begin, 2, 1);
-        unsigned hits = 0;
-        for (std::size_t o = 0; o < shape.num_obstacles && hits != 0xffu; ++o) {
-            const double* limits = shape.obstacles + 4 * o;
-            Lanes nearest_x, nearest_y, unused;
-            least_and_greatest(x, splat(limits[0]), unused, nearest_x);
-            least_and_greatest(nearest_x, splat(limits[2]), nearest_x, unused);
-            least_and_greatest(y, splat(limits[1]), unused, nearest_y);
-            least_and_greatest(nearest_y, splat(limits[3]), nearest_y, unused);
-            const Lanes dx = x - nearest_x, dy = y - nearest_y;
-            hits |= bits_of(dx * dx + dy * dy < shape.radius_squared);
-        }
-        put(out + begin, count - begin, hits);
+        put(out + begin, count - begin, bits_of(discs_hit(shape, x, y)));
     }
+}
+
+/// Which of eight rectangles are in collision, as bits.
+HOLDFAST_INLINE unsigned rectangles_hit(const RectangleShape& shape, const Lanes& x, const Lanes& y,
+                                        const Lanes& angle) {
+    const double radius = shape.bounding_radius;
+    const auto turn = sine_cosine_of(angle);
+    const Lanes& sine = turn.sine;
+    const Lanes& cosine = turn.cosine;
+    const Lanes s = size_of(sine), c = size_of(cosine);
+    const Lanes reach_x = c * shape.half_width + s * shape.half_height;
+    const Lanes reach_y = s * shape.half_width + c * shape.half_height;
+    unsigned hits = 0;
+    for (std::size_t o = 0; o < shape.num_obstacles && hits != 0xffu; ++o) {
+        const double* limits = shape.obstacles + 4 * o;
+        const Lanes left = limits[0] - x, bottom = limits[1] - y;
+        const Lanes right = limits[2] - x, top = limits[3] - y;
+        IntLanes apart = (left >= radius) | (right <= -radius) | (bottom >= radius) |
+                         (top <= -radius) | (left >= reach_x) | (right <= -reach_x) |
+                         (bottom >= reach_y) | (top <= -reach_y);
+        if ((hits | bits_of(apart)) == 0xffu) continue;
+        Lanes low, high, lower, higher;
+        least_and_greatest(left * cosine, right * cosine, low, high);
+        least_and_greatest(bottom * sine, top * sine, lower, higher);
+        apart |= (low + lower >= shape.half_width) | (high + higher <= -shape.half_width);
+        least_and_greatest(left * -sine, right * -sine, low, high);
+        least_and_greatest(bottom * cosine, top * cosine, lower, higher);
+        apart |= (low + lower >= shape.half_height) | (high + higher <= -shape.half_height);
+        hits |= ~bits_of(apart) & 0xffu;
+    }
+    return hits;
 }
 
 static void rectangles_collide(const RectangleShape& shape, const double* states, std::size_t count,
                                std::uint8_t* out) {
-    const double radius = shape.bounding_radius;
     for (std::size_t begin = 0; begin < count; begin += lane_count) {
         const Lanes x = coordinate(states, count, begin, 3, 0);
         const Lanes y = coordinate(states, count, begin, 3, 1);
-        const auto turn = sine_cosine_of(coordinate(states, count, begin, 3, 2));
-        const Lanes& sine = turn.sine;
-        const Lanes& cosine = turn.cosine;
-        const Lanes s = size_of(sine), c = size_of(cosine);
-        const Lanes reach_x = c * shape.half_width + s * shape.half_height;
-        const Lanes reach_y = s * shape.half_width + c * shape.half_height;
-        unsigned hits = 0;
-        for (std::size_t o = 0; o < shape.num_obstacles && hits != 0xffu; ++o) {
-            const double* limits = shape.obstacles + 4 * o;
-            const Lanes left = limits[0] - x, bottom = limits[1] - y;
-            const Lanes right = limits[2] - x, top = limits[3] - y;
-            IntLanes apart = (left >= radius) | (right <= -radius) | (bottom >= radius) |
-                             (top <= -radius) | (left >= reach_x) | (right <= -reach_x) |
-                             (bottom >= reach_y) | (top <= -reach_y);
-            if ((hits | bits_of(apart)) == 0xffu) continue;
-            Lanes low, high, lower, higher;
-            least_and_greatest(left * cosine, right * cosine, low, high);
-            least_and_greatest(bottom * sine, top * sine, lower, higher);
-            apart |= (low + lower >= shape.half_width) | (high + higher <= -shape.half_width);
-            least_and_greatest(left * -sine, right * -sine, low, high);
-            least_and_greatest(bottom * cosine, top * cosine, lower, higher);
-            apart |= (low + lower >= shape.half_height) | (high + higher <= -shape.half_height);
-            hits |= ~bits_of(apart) & 0xffu;
-        }
-        put(out + begin, count - begin, hits);
+        const Lanes angle = coordinate(states, count, begin, 3, 2);
+        put(out + begin, count - begin, rectangles_hit(shape, x, y, angle));
     }
+}
+
+/// Which of eight states can be in collision, as bits: those that are, where that is tested here.
+HOLDFAST_INLINE unsigned bits_hit(const DiscShape& shape, const Lanes (&state)[2]) {
+    return bits_of(discs_hit(shape, state[0], state[1]));
+}
+HOLDFAST_INLINE unsigned bits_hit(const RectangleShape& shape, const Lanes (&state)[3]) {
+    return rectangles_hit(shape, state[0], state[1], state[2]);
+}
+HOLDFAST_INLINE unsigned bits_hit(const BoxShape&, const Lanes (&)[6]) {
+    return 0xffu;
+}
+
+/// Less than the gaps between eight balls and the nearest box by more than rounding can make.
+template <std::size_t space_dimension, std::size_t d>
+HOLDFAST_INLINE Lanes clearance(const RoundShape& shape, const Lanes (&state)[d]) {
+    Lanes gap = splat(__builtin_inf()), unused;
+    for (std::size_t o = 0; o < shape.num_obstacles; ++o) {
+        const double* low = shape.obstacles + 2 * space_dimension * o;
+        const double* high = low + space_dimension;
+        Lanes widest = splat(-__builtin_inf());
+        for (std::size_t c = 0; c < space_dimension; ++c) {
+            least_and_greatest(low[c] - state[c], widest, unused, widest);
+            least_and_greatest(state[c] - high[c], widest, unused, widest);
+        }
+        least_and_greatest(gap, widest, gap, unused);
+    }
+    Lanes size = splat(1.0 + shape.radius);
+    for (std::size_t c = 0; c < space_dimension; ++c) size += size_of(state[c]);
+    return gap - shape.radius - 1e-9 * size;
 }
 
 }  // namespace holdfast::inline HOLDFAST_ISA

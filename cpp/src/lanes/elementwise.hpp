@@ -110,44 +110,57 @@ HOLDFAST_INLINE Lanes unit_interval(const IntLanes& high, const IntLanes& low) {
            0x1p-53;
 }
 
-/// Draws [firsts[i], firsts[i] + count) of each of several streams, one stream below the other.
-static void normals_of_each(const Stream* streams, const std::uint64_t* firsts, std::size_t number,
-                            std::size_t count, double* out) {
-    if (number == 0 || count == 0) return;
-    std::size_t s = 0;
-    std::uint64_t next_block = firsts[0] >> 1;
-    while (s < number) {
+HOLDFAST_INLINE void normals_of(const PhiloxLanes& drawn, Lanes& even, Lanes& odd) {
+    box_muller(unit_interval(drawn.words[0], drawn.words[1]),
+               unit_interval(drawn.words[2], drawn.words[3]), even, odd);
+}
+
+/// Both draws of blocks [firsts[i], firsts[i] + each) of each of several streams, one stream below
+/// the other.
+static void normal_blocks(const Stream* streams, const std::uint32_t* firsts, std::size_t number,
+                          std::size_t each, double* out) {
+    const std::size_t total = number * each;
+    std::size_t s = 0, b = 0;
+    for (std::size_t begin = 0; begin < total; begin += lane_count) {
         const Stream* own[lane_count];
         std::uint32_t block[lane_count];
-        std::size_t of_stream[lane_count];
-        std::size_t used = 0;
-        for (; used < lane_count && s < number; ++used) {
-            own[used] = &streams[s];
-            block[used] = static_cast<std::uint32_t>(next_block);
-            of_stream[used] = s;
-            if (2 * ++next_block >= firsts[s] + count && ++s < number) next_block = firsts[s] >> 1;
+        for (std::size_t lane = 0; lane < lane_count; ++lane) {
+            own[lane] = &streams[s];
+            block[lane] = firsts[s] + static_cast<std::uint32_t>(b);
+            if (begin + lane + 1 < total && ++b == each) {
+                b = 0;
+                ++s;
+            }
         }
-        for (std::size_t lane = used; lane < lane_count; ++lane) {
-            own[lane] = own[used - 1];
-            block[lane] = block[used - 1];
-        }
-        const PhiloxLanes drawn = philox_lanes(own, block);
         Lanes even, odd;
-        box_muller(unit_interval(drawn.words[0], drawn.words[1]),
-                   unit_interval(drawn.words[2], drawn.words[3]), even, odd);
-        for (std::size_t lane = 0; lane < used; ++lane) {
-            double* row = out + of_stream[lane] * count;
-            // Before the first one this wraps to a large number.
-            const std::uint64_t at = 2 * std::uint64_t{block[lane]} - firsts[of_stream[lane]];
-            if (at < count) row[at] = even[lane];
-            if (at + 1 < count) row[at + 1] = odd[lane];
+        normals_of(philox_lanes(own, block), even, odd);
+        for (std::size_t lane = 0; lane < lane_count && begin + lane < total; ++lane) {
+            out[2 * (begin + lane)] = even[lane];
+            out[2 * (begin + lane) + 1] = odd[lane];
         }
     }
 }
 
 static void normals_array(const Stream& stream, std::uint64_t first, std::size_t count,
                           double* out) {
-    normals_of_each(&stream, &first, 1, count, out);
+    const auto first_block = static_cast<std::uint32_t>(first >> 1);
+    const std::size_t before = first & 1;  // a draw of the first block that is not asked for
+    const Stream* own[lane_count];
+    for (const Stream*& each : own) each = &stream;
+    for (std::size_t at = 0; at < before + count; at += 2 * lane_count) {
+        std::uint32_t block[lane_count];
+        for (std::size_t lane = 0; lane < lane_count; ++lane) {
+            block[lane] = first_block + static_cast<std::uint32_t>(at / 2 + lane);
+        }
+        Lanes even, odd;
+        normals_of(philox_lanes(own, block), even, odd);
+        for (std::size_t lane = 0; lane < lane_count; ++lane) {
+            // Before the first one this wraps to a large number.
+            const std::size_t place = at + 2 * lane - before;
+            if (place < count) out[place] = even[lane];
+            if (place + 1 < count) out[place + 1] = odd[lane];
+        }
+    }
 }
 
 /// out[i] = substream numbers[i] of parents[i]. `out` may be `parents`.

@@ -11,6 +11,7 @@
 #include "elementwise.hpp"
 #include "few_points.hpp"
 #include "group_entropy.hpp"
+#include "policy_steps.hpp"
 #include "posterior.hpp"
 #include "prior_block.hpp"
 
@@ -18,11 +19,31 @@ namespace holdfast::inline HOLDFAST_ISA {
 
 extern const VectorKernels table;
 const VectorKernels table = {
-    HOLDFAST_ISA_NAME, exp_array,       log_array,       sin_array,     cos_array,
-    normals_array,     normals_of_each, substreams,      discs_collide, rectangles_collide,
-    sum_array,         weighted_sum,    weighted_sums,   posterior,     normalize,
-    compact_nearest,   few_nearest,     compact_mixture, group_nearest, block_nearest,
-    group_mixture,     prior_block,
+    HOLDFAST_ISA_NAME,
+    exp_array,
+    log_array,
+    sin_array,
+    cos_array,
+    normals_array,
+    normal_blocks,
+    substreams,
+    discs_collide,
+    rectangles_collide,
+    steps_of<PegPolicy2D, RectangleShape>,
+    steps_of<PegPolicy3D, BoxShape>,
+    steps_of<ViaPointPolicy, DiscShape>,
+    sum_array,
+    weighted_sum,
+    weighted_sums,
+    posterior,
+    normalize,
+    compact_nearest,
+    few_nearest,
+    compact_mixture,
+    group_nearest,
+    block_nearest,
+    group_mixture,
+    prior_block,
 };
 
 }  // namespace holdfast::inline HOLDFAST_ISA

@@ -240,7 +240,15 @@ HOLDFAST_INLINE double square_root(double x) {
 }
 HOLDFAST_INLINE Lanes square_root(const Lanes& x) {
     Lanes result;
+#if defined(__AVX512DQ__)
+    result.part[0] = _mm512_sqrt_pd(x.part[0]);
+#elif defined(__AVX__)
+    HOLDFAST_EACH_REGISTER(result.part[r] = _mm256_sqrt_pd(x.part[r]))
+#elif defined(__SSE2__)
+    HOLDFAST_EACH_REGISTER(result.part[r] = _mm_sqrt_pd(x.part[r]))
+#else
     for (std::size_t i = 0; i < lane_count; ++i) result[i] = __builtin_sqrt(x[i]);
+#endif
     return result;
 }
 
@@ -282,6 +290,15 @@ HOLDFAST_INLINE unsigned bits_of(const IntLanes& mask) {
     }
     return bits;
 #endif
+}
+
+/// The truth values whose bits these are.
+HOLDFAST_INLINE IntLanes lanes_of(unsigned bits) {
+    std::int64_t values[lane_count];
+    for (std::size_t i = 0; i < lane_count; ++i) values[i] = -std::int64_t{bits >> i & 1u};
+    IntLanes result;
+    std::memcpy(&result, values, sizeof result);
+    return result;
 }
 
 /// bits_of(a <= b), where the compiler would go by way of eight truth values.

@@ -196,8 +196,8 @@ class _World(KeepsReadOnly):
             offsets,
             tolerance,
             threads,
-            states_at.reshape(-1, self.dimension),
-            stages_at.reshape(-1),
+            states_at,
+            stages_at,
         )
         if not followed:
             _raise_not_finite("states", states)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from holdfast import _kernel
 from holdfast.errors import InvalidValueError, ProblemError
 from holdfast.numerics.arrays import FloatArray, IntArray, in_brief
 from holdfast.numerics.randomness import NoiseFreeStream
@@ -85,8 +86,9 @@ def _followed(
     if has_own(problem, "expected_path", _STEP):
         states_at, stages_at = checked.expected_path(problem, states, stage, offsets, threads)
         # An integer is faster than equal stages for all: most policies then select once.
-        if problem.num_stages == 1 or (stages_at == stages_at.flat[0]).all():
-            return states_at, int(stages_at.flat[0])
+        first = int(stages_at.flat[0])
+        if problem.num_stages == 1 or _kernel.all_integers_within(stages_at, first, first):
+            return states_at, first
         return states_at, stages_at
     states_at = np.empty((len(offsets), *states.shape))
     stages_at = np.full(states_at.shape[:2], stage, dtype=np.int64)
