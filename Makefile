@@ -73,7 +73,7 @@ test-compiled: $(INSTALLED_COMPILED) ## the simulator's tests and 10,000 seeds t
 	    tests/processes/test_compiled.py
 
 test-deploy: $(INSTALLED_DEV) ## images, tunnels and machines; root, and packages that .ci/run installs
-	$(BIN)/pytest -q $(LONG) -m "deploy and not slow" tests/deploy
+	$(BIN)/pytest -q $(LONG) -n 2 --dist loadgroup --durations=12 -m "deploy and not slow" tests/deploy
 
 test-deploy-slow: $(INSTALLED_DEV) ## those of them that take minutes
 	$(BIN)/pytest -q $(LONG) -m "deploy and slow" tests/deploy
