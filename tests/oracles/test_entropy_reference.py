@@ -91,7 +91,10 @@ class Found(NamedTuple):
 
 
 def find(
-    points: FloatArray, weights: FloatArray, estimator: NearestNeighbor | GaussianMixture
+    points: FloatArray,
+    weights: FloatArray,
+    estimator: NearestNeighbor | GaussianMixture,
+    sampled: bool = False,
 ) -> Found:
     """Return what :func:`holdfast.planning.estimators.entropy` returns, with the ways to it."""
     kernel = kernel_estimator(estimator, points.shape[1])
@@ -103,6 +106,7 @@ def find(
         1,
         (1.0,),
         kernel.prior,
+        sampled,
     )
     return Found(result, visits, Ways(*ways))
 

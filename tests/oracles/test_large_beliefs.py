@@ -1,13 +1,13 @@
-"""Nearest neighbours of many points, where the kernel takes the leaves of its tree in blocks.
+"""Nearest neighbours of many points: leaves of the tree in blocks, and terms of a sample.
 
-It does so in trees of more than 16,384 points. A belief of as many particles or fewer has no such
-tree, so its decisions keep the bits that they had before there were blocks. Here
-``use_blocks_beyond`` lets small trees be taken in blocks as well, whose entropies the reference
-gives in a short time.
+The kernel begins with that beyond 16,384 points. A belief of as many particles or fewer keeps the
+bits that its decisions had before. Here ``take_as_few_up_to`` lets few points be taken as many,
+whose entropies the reference gives in a short time.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -17,7 +17,7 @@ from tests.oracles.test_entropy_reference import TOLERANCE, WAYS, draw_weights, 
 
 from holdfast import _kernel
 from holdfast.numerics.arrays import FloatArray
-from holdfast.planning.estimators import NearestNeighbor
+from holdfast.planning.estimators import GaussianMixture, NearestNeighbor, entropy
 
 LIMIT = 16_384
 
@@ -41,14 +41,14 @@ def draw_belief(kind: str, count: int, dimension: int) -> FloatArray:
 
 @pytest.fixture
 def usual_limit() -> Iterator[None]:
-    assert _kernel.use_blocks_beyond(LIMIT) == LIMIT
+    assert _kernel.take_as_few_up_to(LIMIT) == LIMIT
     yield
-    _kernel.use_blocks_beyond(LIMIT)
+    _kernel.take_as_few_up_to(LIMIT)
 
 
 @pytest.fixture
 def in_blocks(usual_limit: None) -> None:
-    _kernel.use_blocks_beyond(0)
+    _kernel.take_as_few_up_to(0)
 
 
 @pytest.mark.parametrize("posteriors", [1, 9, 17, 27])
@@ -100,7 +100,7 @@ def test_more_points_than_short_counts_hold(posteriors: int, usual_limit: None) 
     weights = np.random.default_rng(11).uniform(0.5, 1.0, size=(posteriors, len(points)))
     weights[:, :16] *= 1e4
     found = find(points, weights, NearestNeighbor(5, 1.0))
-    _kernel.use_blocks_beyond(len(points))
+    _kernel.take_as_few_up_to(len(points))
     expected = find(points, weights, NearestNeighbor(5, 1.0))
     assert np.abs(found.entropies - expected.entropies).max() <= TOLERANCE
 
@@ -113,16 +113,64 @@ def test_blocks_begin_beyond_the_limit(posteriors: int, usual_limit: None) -> No
     for count in (LIMIT, LIMIT + 1):
         few, part = points[:count], weights[:, :count]
         usual = find(few, part, NearestNeighbor(5, 0.3))
-        _kernel.use_blocks_beyond(count)
+        _kernel.take_as_few_up_to(count)
         by_leaves = find(few, part, NearestNeighbor(5, 0.3))
-        _kernel.use_blocks_beyond(LIMIT)
+        _kernel.take_as_few_up_to(LIMIT)
         assert np.allclose(usual.entropies, by_leaves.entropies, rtol=0.0, atol=TOLERANCE)
         same = usual.entropies.tobytes() == by_leaves.entropies.tobytes()
         assert same == (count == LIMIT)
 
 
-def test_threads_change_no_bit(in_blocks: None) -> None:
-    count = 5000
+def posteriors_of(points: FloatArray, kind: str, seed: int) -> FloatArray:
+    """Return 12 Gaussian likelihoods of a first coordinate, observed at points drawn at random."""
+    rng = np.random.default_rng([13, seed])
+    deviation = {"alike": 3.0, "different": 0.5, "few points each": 0.04}[kind]
+    seen = points[rng.integers(0, len(points), size=(12, 1)), 0]
+    weights: FloatArray = np.exp(-0.5 * ((points[:, 0] - seen) / deviation) ** 2)
+    return weights
+
+
+@pytest.mark.parametrize("kind", ["alike", "different", "few points each"])
+@pytest.mark.parametrize(
+    ("dimension", "estimator"),
+    [*itertools.product([1, 2, 3, 6], ["lists", "lists and balls", "balls"]), (2, "mixture")],
+)
+def test_a_sample_is_right_within_its_error(dimension: int, estimator: str, kind: str) -> None:
+    """At least 128 points stand for a posterior. Their terms, of density, have a standard deviation
+    of the root of d/2 for a Gaussian, and a little more as neighbours are few."""
+    resolution = {"lists": 1e-4, "lists and balls": 0.1 * dimension, "balls": 0.6 * dimension}
+    errors = []
+    for seed in range(3):
+        points = np.random.default_rng([14, dimension, seed]).normal(size=(LIMIT + 1, dimension))
+        weights = posteriors_of(points, kind, seed)
+        way = GaussianMixture(np.full(dimension, 0.05))
+        if estimator != "mixture":
+            way = NearestNeighbor(5, resolution[estimator])
+        exact = find(points, weights, way)
+        sampled = find(points, weights, way, sampled=True)
+        assert sampled.visits < exact.visits
+        errors.append(sampled.entropies - exact.entropies)
+    error = np.sqrt((0.5 * dimension + 0.25) / 128.0)
+    assert 0.0 < np.sqrt(np.square(errors).mean()) < error
+    assert np.abs(errors).max() < 4.0 * error
+    # No bias: the errors of a seed are alike, those of different ones are independent.
+    assert abs(np.mean(errors)) < 2.0 * error / np.sqrt(3.0)
+
+
+def test_up_to_the_limit_and_for_users_all_terms_are_added() -> None:
+    points = draw_belief("spread", LIMIT + 1, 2)
+    weights = posteriors_of(points, "alike", 0)
+    few = find(points[1:], weights[:, 1:], NearestNeighbor(5, 0.3), sampled=True)
+    all_of_few = find(points[1:], weights[:, 1:], NearestNeighbor(5, 0.3))
+    assert few.entropies.tobytes() == all_of_few.entropies.tobytes()
+    assert few.visits == all_of_few.visits
+    exact = entropy(points, weights, NearestNeighbor(5, 0.3))
+    assert np.array_equal(exact, find(points, weights, NearestNeighbor(5, 0.3)).entropies)
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_threads_change_no_bit(sampled: bool, in_blocks: None) -> None:
+    count = 11_000
     points = draw_belief("spread", 2 * count, 3)
     weights = np.abs(np.random.default_rng(10).normal(size=(9, count)))
     weights[7:, count // 3 :] = 0.0  # a tree of their own
@@ -131,7 +179,18 @@ def test_threads_change_no_bit(in_blocks: None) -> None:
     try:
         results = {
             _kernel.entropies(
-                points, weights, False, 0, 5, 0.3, 0.0, 0.0, threads, (1.0, 0.5), np.empty(0)
+                points,
+                weights,
+                False,
+                0,
+                5,
+                0.3,
+                0.0,
+                0.0,
+                threads,
+                (1.0, 0.5),
+                np.empty(0),
+                sampled,
             )[0].tobytes()
             for threads in (1, 2, 3, 64)
         }
