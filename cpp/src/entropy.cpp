@@ -240,7 +240,8 @@ class Group {
             sampled_.resize(columns);
             for (std::size_t i = 0; i < view.count; ++i) {
                 for (std::size_t column = 0; column < columns; ++column) {
-                    sampled_[column] += view.factors[i] * weights_[view.slots[i] * columns + column];
+                    sampled_[column] +=
+                        view.factors[i] * weights_[view.slots[i] * columns + column];
                 }
             }
         }
@@ -275,8 +276,7 @@ class Group {
             task_.kernels->group_nearest(view_, leaf, task_.constants, scratch.data(), terms,
                                          visits);
         } else {
-            task_.kernels->block_nearest(view_, leaf,
-                                         std::min(leaves_of_piece_, leaves_ - leaf),
+            task_.kernels->block_nearest(view_, leaf, std::min(leaves_of_piece_, leaves_ - leaf),
                                          task_.constants, scratch.data(), terms, visits);
         }
     }

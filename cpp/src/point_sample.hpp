@@ -1,12 +1,12 @@
 // A sample of the points of a tree, whose terms stand for those of all.
 //
-// An entropy is a weighted mean of terms, one of each point. Of many points a sample gives it within
-// a known error, at a cost that does not grow with their number times that of the points around
-// them. A point comes in with a probability in proportion to its greatest weight under any of some
-// posteriors, and counts in inverse proportion to it (Horvitz and Thompson, 1952); a posterior's
-// entropy is the ratio of two such sums (Hajek, 1971). In the order of the tree each part of equal
-// probability has one draw, at random: so the sample is spread over the points as their weights
-// are, and neither the middle of a part nor its edge is preferred.
+// An entropy is a weighted mean of terms, one of each point. Of many points a sample gives it
+// within a known error, at a cost that does not grow with their number times that of the points
+// around them. A point comes in with a probability in proportion to its greatest weight under any
+// of some posteriors, and counts in inverse proportion to it (Horvitz and Thompson, 1952); a
+// posterior's entropy is the ratio of two such sums (Hajek, 1971). In the order of the tree each
+// part of equal probability has one draw, at random: so the sample is spread over the points as
+// their weights are, and neither the middle of a part nor its edge is preferred.
 //
 // The random numbers are the same for all samples, so equal points and weights have equal ones.
 

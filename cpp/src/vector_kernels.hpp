@@ -33,9 +33,9 @@ struct PosteriorInput {
 
 /// A sample of a tree's points, whose terms stand for those of all: in leaves of 16, as the tree's.
 struct SampleView {
-    std::size_t count;         // 0: every point of the tree is asked for
-    const double* coordinates; // [leaves][dimension][16]
-    const double* low;         // [leaves][dimension], of the box around a leaf's points
+    std::size_t count;          // 0: every point of the tree is asked for
+    const double* coordinates;  // [leaves][dimension][16]
+    const double* low;          // [leaves][dimension], of the box around a leaf's points
     const double* high;
     const std::uint32_t* slots;  // [count] where the tree has them
     const double* factors;       // [count] by which their weights are multiplied

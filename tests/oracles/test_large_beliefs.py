@@ -105,22 +105,6 @@ def test_more_points_than_short_counts_hold(posteriors: int, usual_limit: None) 
     assert np.abs(found.entropies - expected.entropies).max() <= TOLERANCE
 
 
-@pytest.mark.parametrize("posteriors", [1, 9])
-def test_blocks_begin_beyond_the_limit(posteriors: int, usual_limit: None) -> None:
-    """Up to it every bit is that of leaf by leaf; beyond it some of nearest neighbours differ."""
-    points = draw_belief("spread", LIMIT + 1, 3)
-    weights = draw_weights(np.random.default_rng(12), "similar", posteriors, LIMIT + 1, LIMIT + 1)
-    for count in (LIMIT, LIMIT + 1):
-        few, part = points[:count], weights[:, :count]
-        usual = find(few, part, NearestNeighbor(5, 0.3))
-        _kernel.take_as_few_up_to(count)
-        by_leaves = find(few, part, NearestNeighbor(5, 0.3))
-        _kernel.take_as_few_up_to(LIMIT)
-        assert np.allclose(usual.entropies, by_leaves.entropies, rtol=0.0, atol=TOLERANCE)
-        same = usual.entropies.tobytes() == by_leaves.entropies.tobytes()
-        assert same == (count == LIMIT)
-
-
 def posteriors_of(points: FloatArray, kind: str, seed: int) -> FloatArray:
     """Return 12 Gaussian likelihoods of a first coordinate, observed at points drawn at random."""
     rng = np.random.default_rng([13, seed])
@@ -143,9 +127,9 @@ def test_a_sample_is_right_within_its_error(dimension: int, estimator: str, kind
     for seed in range(3):
         points = np.random.default_rng([14, dimension, seed]).normal(size=(LIMIT + 1, dimension))
         weights = posteriors_of(points, kind, seed)
-        way = GaussianMixture(np.full(dimension, 0.05))
-        if estimator != "mixture":
-            way = NearestNeighbor(5, resolution[estimator])
+        way: NearestNeighbor | GaussianMixture = NearestNeighbor(5, resolution.get(estimator, 1.0))
+        if estimator == "mixture":
+            way = GaussianMixture(np.full(dimension, 0.05))
         exact = find(points, weights, way)
         sampled = find(points, weights, way, sampled=True)
         assert sampled.visits < exact.visits
@@ -175,23 +159,11 @@ def test_threads_change_no_bit(sampled: bool, in_blocks: None) -> None:
     weights = np.abs(np.random.default_rng(10).normal(size=(9, count)))
     weights[7:, count // 3 :] = 0.0  # a tree of their own
     weights[8, count // 10 :] = 0.0
+    arguments = (points, weights, False, 0, 5, 0.3, 0.0, 0.0)
     before = _kernel.use_threads_from(0.0)
     try:
         results = {
-            _kernel.entropies(
-                points,
-                weights,
-                False,
-                0,
-                5,
-                0.3,
-                0.0,
-                0.0,
-                threads,
-                (1.0, 0.5),
-                np.empty(0),
-                sampled,
-            )[0].tobytes()
+            _kernel.entropies(*arguments, threads, (1.0, 0.5), np.empty(0), sampled)[0].tobytes()
             for threads in (1, 2, 3, 64)
         }
     finally:

@@ -112,7 +112,8 @@ for count, dimension, kept, posteriors, way in (
     note(f"variance {count} {dimension} {kept}", result)
     prior = np.full(count, 1.0 / count)
     for name, own in (("spread", points), ("few", np.round(points))):
-        result, *_ = kernel.entropies(own, normals, True, 3, 5, 0.1, 0.0, 0.0, 2, (1.0,), prior, True)
+        result, *_ = kernel.entropies(
+            own, normals, True, 3, 5, 0.1, 0.0, 0.0, 2, (1.0,), prior, True)
         note(f"prior neighbours {count} {dimension} {kept} {name}", result)
 
 kernel.take_as_few_up_to(0)

@@ -27,7 +27,7 @@ static void group_nearest_rows(const PosteriorGroup& group, const QueryLeaf& que
     Lanes wanted[vectors];  // the k of each column
     // Where all lists would end within the resolution, all points need their balls.
     dense = dense || !find_nearest(group.tree, query, lists, visits, resolution_squared,
-                                    group.sample.count != 0);
+                                   group.sample.count != 0);
     if (!dense) {
         for (std::size_t v = 0; v < vectors; ++v) {
             for (std::size_t lane = 0; lane < lane_count; ++lane) {
@@ -115,8 +115,7 @@ static void group_mixture_rows(const PosteriorGroup& group, std::size_t leaf, do
     }
     for (std::size_t i = 0; i < query.used; ++i) {
         for (std::size_t v = 0; v < vectors; ++v) {
-            const Lanes weight =
-                load(group.weights + query.slots[i] * columns + v * lane_count);
+            const Lanes weight = load(group.weights + query.slots[i] * columns + v * lane_count);
             const Lanes term = select(weight > 0.0, weight * log_of(totals[i][v]), Lanes{});
             store(out + v * lane_count, load(out + v * lane_count) - query.factors[i] * term);
         }

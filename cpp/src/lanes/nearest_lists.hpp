@@ -255,10 +255,9 @@ static void walk_outwards(const PosteriorGroup& group, const QueryLeaf& query, s
                                         ? group.neighbors[column]
                                         : static_cast<std::uint32_t>(within[v][lane]);
             terms[v][lane] +=
-                factor *
-                (weight[lane] * (constants.log_ball_volume +
-                                 static_cast<double>(tree.dimension) * log_radius[lane] -
-                                 log_mass[lane] + constants.bias_correction[q]));
+                factor * (weight[lane] * (constants.log_ball_volume +
+                                          static_cast<double>(tree.dimension) * log_radius[lane] -
+                                          log_mass[lane] + constants.bias_correction[q]));
         }
     }
 }
@@ -269,8 +268,8 @@ static void walk_outwards(const PosteriorGroup& group, const QueryLeaf& query, s
 template <std::size_t length, class WeightOf>
 HOLDFAST_INLINE unsigned walk_single(const Lanes* keys, double complete_below,
                                      const WeightOf& weight_of, const Lanes& own_weight,
-                                     const Lanes& factors,
-                                     std::uint32_t neighbors, std::size_t dimension,
+                                     const Lanes& factors, std::uint32_t neighbors,
+                                     std::size_t dimension,
                                      const NearestNeighborConstants& constants, double& sum) {
     const double resolution_squared = constants.resolution * constants.resolution * tie_tolerance;
     const Lanes last = detail::from_bits<Lanes>(detail::bits(keys[length - 1]) & ~number_bits);

@@ -105,8 +105,7 @@ HOLDFAST_INLINE void open_leaf(const TreeView& tree, const SampleView& sample, s
     const bool sampled = sample.count != 0;
     const std::size_t left = (sampled ? sample.count : tree.count) - first;
     query.used = left < leaf_size ? left : leaf_size;
-    query.coordinates =
-        (sampled ? sample.coordinates : tree.coordinates) + first * tree.dimension;
+    query.coordinates = (sampled ? sample.coordinates : tree.coordinates) + first * tree.dimension;
     if (sampled) {
         query.low = sample.low + leaf * tree.dimension;
         query.high = sample.high + leaf * tree.dimension;
