@@ -40,15 +40,10 @@ def draw_belief(kind: str, count: int, dimension: int) -> FloatArray:
 
 
 @pytest.fixture
-def usual_limit() -> Iterator[None]:
-    assert _kernel.take_as_few_up_to(LIMIT) == LIMIT
+def in_blocks() -> Iterator[None]:
+    assert _kernel.take_as_few_up_to(0) == LIMIT
     yield
     _kernel.take_as_few_up_to(LIMIT)
-
-
-@pytest.fixture
-def in_blocks(usual_limit: None) -> None:
-    _kernel.take_as_few_up_to(0)
 
 
 @pytest.mark.parametrize("posteriors", [1, 9, 17, 27])
@@ -93,7 +88,7 @@ def test_a_point_among_its_copies_in_blocks(posteriors: int, in_blocks: None) ->
 
 
 @pytest.mark.parametrize("posteriors", [1, 9])
-def test_more_points_than_short_counts_hold(posteriors: int, usual_limit: None) -> None:
+def test_more_points_than_short_counts_hold(posteriors: int, in_blocks: None) -> None:
     """Counts have 16 bits until they are added up. Some balls of a leaf hold 65,546 copies of a
     point, in leaves that are taken one by one since other balls of the same leaf hold none."""
     points = np.concatenate([np.linspace(0.0, 0.5, 16), np.full(2**16 + 10, 1.2)]).reshape(-1, 1)
@@ -137,7 +132,6 @@ def test_a_sample_is_right_within_its_error(dimension: int, estimator: str, kind
     error = np.sqrt((0.5 * dimension + 0.25) / 128.0)
     assert 0.0 < np.sqrt(np.square(errors).mean()) < error
     assert np.abs(errors).max() < 4.0 * error
-    # No bias: the errors of a seed are alike, those of different ones are independent.
     assert abs(np.mean(errors)) < 2.0 * error / np.sqrt(3.0)
 
 
@@ -147,7 +141,6 @@ def test_up_to_the_limit_and_for_users_all_terms_are_added() -> None:
     few = find(points[1:], weights[:, 1:], NearestNeighbor(5, 0.3), sampled=True)
     all_of_few = find(points[1:], weights[:, 1:], NearestNeighbor(5, 0.3))
     assert few.entropies.tobytes() == all_of_few.entropies.tobytes()
-    assert few.visits == all_of_few.visits
     exact = entropy(points, weights, NearestNeighbor(5, 0.3))
     assert np.array_equal(exact, find(points, weights, NearestNeighbor(5, 0.3)).entropies)
 

@@ -118,12 +118,9 @@ for count, dimension, kept, posteriors, way in (
 
 kernel.take_as_few_up_to(0)
 points, normals = stream.substream(7).normal((5000, 3)), stream.substream(8).normal((9, 5000))
-for kind, resolution in ((0, 1e-9), (0, 0.2), (0, 2.0), (1, 1.0)):
-    result, _, visits, _ = kernel.entropies(
-        points, normals, True, kind, 5, resolution, 0.5, 0.0, 2, *alone, True)
-    note(f"sample {kind} {resolution}", result, np.array(visits))
-kernel.take_as_few_up_to(usual)
-
+for kind, own in ((0, 1e-9), (0, 0.2), (0, 2.0), (1, 1.0)):
+    found = kernel.entropies(points, normals, True, kind, 5, own, 0.5, 0.0, 2, *alone, True)
+    note(f"sample {kind} {own}", found[0])
 for count in (5, 100, 1001):
     draw = stream.substream(count)
     states = draw.normal((count, 3))
