@@ -112,15 +112,14 @@ for count, dimension, kept, posteriors, way in (
     note(f"variance {count} {dimension} {kept}", result)
     prior = np.full(count, 1.0 / count)
     for name, own in (("spread", points), ("few", np.round(points))):
-        result, *_ = kernel.entropies(
-            own, normals, True, 3, 5, 0.1, 0.0, 0.0, 2, (1.0,), prior, True)
+        result, *_ = kernel.entropies(own, normals, True, 3, 5, 0.1, 0., 0., 2, (1.0,), prior, True)
         note(f"prior neighbours {count} {dimension} {kept} {name}", result)
 
 kernel.take_as_few_up_to(0)
 points, normals = stream.substream(7).normal((5000, 3)), stream.substream(8).normal((9, 5000))
 for kind, own in ((0, 1e-9), (0, 0.2), (0, 2.0), (1, 1.0)):
-    found = kernel.entropies(points, normals, True, kind, 5, own, 0.5, 0.0, 2, *alone, True)
-    note(f"sample {kind} {own}", found[0])
+    note(f"sample {kind} {own}", kernel.entropies(
+        points, normals, True, kind, 5, own, 0.5, 0.0, 2, *alone, True)[0])
 for count in (5, 100, 1001):
     draw = stream.substream(count)
     states = draw.normal((count, 3))
