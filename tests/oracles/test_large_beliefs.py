@@ -23,7 +23,7 @@ LIMIT = 16_384
 
 
 def draw_belief(kind: str, count: int, dimension: int) -> FloatArray:
-    """Return points of about unit width, as beliefs are."""
+    """Return points of about unit width."""
     rng = np.random.default_rng([7, dimension])
     points = rng.normal(size=(count, dimension))
     if kind == "resampled":  # each some twenty times
@@ -105,8 +105,7 @@ def posteriors_of(points: FloatArray, kind: str, seed: int) -> FloatArray:
     rng = np.random.default_rng([13, seed])
     deviation = {"alike": 3.0, "different": 0.5, "few points each": 0.04}[kind]
     seen = points[rng.integers(0, len(points), size=(12, 1)), 0]
-    weights: FloatArray = np.exp(-0.5 * ((points[:, 0] - seen) / deviation) ** 2)
-    return weights
+    return np.asarray(np.exp(-0.5 * ((points[:, 0] - seen) / deviation) ** 2))
 
 
 @pytest.mark.parametrize("kind", ["alike", "different", "few points each"])
@@ -129,8 +128,7 @@ def test_a_sample_is_right_within_its_error(dimension: int, estimator: str, kind
         assert sampled.visits < exact.visits
         errors.append(sampled.entropies - exact.entropies)
     error = np.sqrt((0.5 * dimension + 0.25) / 128.0)
-    assert 0.0 < np.sqrt(np.square(errors).mean()) < error
-    assert np.abs(errors).max() < 4.0 * error
+    assert 0.0 < np.sqrt(np.square(errors).mean()) < error > 0.25 * np.abs(errors).max()
     assert abs(np.mean(errors)) < 2.0 * error / np.sqrt(3.0)
 
 
@@ -139,7 +137,7 @@ def test_up_to_the_limit_and_for_users_all_terms_are_added() -> None:
     weights = posteriors_of(points, "alike", 0)
     way = NearestNeighbor(5, 0.3)
     few = [find(points[1:], weights[:, 1:], way, sampled=each).entropies for each in (False, True)]
-    assert np.array_equal(*few)
+    assert np.array_equal(few[0], few[1])
     assert np.array_equal(entropy(points, weights, way), find(points, weights, way).entropies)
 
 
