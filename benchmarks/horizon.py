@@ -61,6 +61,7 @@ def one_by_one(
                     1,
                     (1.0,),
                     estimator.prior,
+                    True,
                 )
                 later[j, i] += factor * found[0]
     return later

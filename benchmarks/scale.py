@@ -39,8 +39,14 @@ def large(context: Context) -> Result:
         "deviation 0.03": {"deviation": 0.03},
         "heavy tails, 0.05": {"deviation": 0.05, "heavy_tails": True},
         "in space, 0.3": {"deviation": 0.3, "in_space": True},
-        "in space, 0.02": {"deviation": 0.02, "in_space": True},
+        "in space, 0.01": {"deviation": 0.01, "in_space": True},
         "path entropy, 0.03": {"deviation": 0.03, "default": True},
+        "path entropy in space, heavy tails, 0.05": {
+            "deviation": 0.05,
+            "in_space": True,
+            "heavy_tails": True,
+            "default": True,
+        },
     }
     processes = 1 if context.quick else 3
     seconds: dict[str, list[float]] = {label: [] for label in beliefs}
@@ -90,6 +96,7 @@ def large(context: Context) -> Result:
                 observation, and the more of them lie within the resolution (0.1) of each other.
                 Heavy tails are those of Student's t distribution with two degrees of freedom, in
                 space J = 6, and path entropy, the default, takes two sets of actions.
+                Entropies are those of a sample (docs/decisions/many_entropies.md).
                 Peak memory is that of the whole process, which before the decision has
                 {before / 1e6:.0f} MB."""
             ),

@@ -28,11 +28,11 @@ constexpr double nanoseconds_of_a_point = 100.0;
 
 EntropySettings make_settings(Estimator estimator, std::uint32_t neighbors, double resolution,
                               double exponent, double offset, int threads, const Input<1>& prior,
-                              std::size_t count) {
+                              std::size_t count, bool sampled = true) {
     if (estimator == Estimator::prior_neighbors && prior.shape(0) != count) {
         throw nb::value_error("prior and weights do not fit");
     }
-    return {estimator, neighbors, resolution, exponent, offset, threads, prior.data()};
+    return {estimator, neighbors, resolution, exponent, offset, threads, prior.data(), sampled};
 }
 
 /// `number` as in `EstimatorKind` of planning/estimators.py.
@@ -85,8 +85,8 @@ double seconds_since(std::chrono::steady_clock::time_point start) {
 void holdfast::bind_entropy(nb::module_& module) {
     define(module, "use_threads_from",
            [](double nanoseconds) { return use_threads_from(nanoseconds); });
-    define(module, "use_blocks_beyond",
-           [](std::size_t points) { return use_blocks_beyond(points); });
+    define(module, "take_as_few_up_to",
+           [](std::size_t points) { return take_as_few_up_to(points); });
     define(module, "threads_started", [] { return threads_started(); });
     // The caller keeps the flag alive until it watches another one, or none.
     define(
@@ -97,35 +97,36 @@ void holdfast::bind_entropy(nb::module_& module) {
         nb::arg("flag").none(), nb::arg("most_s"));
     define(module, "is_interrupted", [] { return is_interrupted(); });
 
-    define(module, "entropies",
-           [](const Input<2>& points, const Input<2>& rows_in, bool logarithms, int number,
-              std::uint32_t neighbors, double resolution, double exponent, double offset,
-              int threads, const std::vector<double>& factors, const Input<1>& prior) {
-               const std::size_t posteriors = rows_in.shape(0), count = rows_in.shape(1);
-               const PointSets sets = make_sets(points, count, factors);
-               double* out;
-               auto result = make_array<double>({posteriors}, out);
-               EntropyCounts counts;
-               const Estimator estimator = to_estimator(number);
-               const EntropySettings settings = make_settings(
-                   estimator, neighbors, resolution, exponent, offset, threads, prior, count);
-               const bool drop = drops_negligible(estimator);
-               {
-                   WithoutInterpreter released;
-                   const VectorKernels& kernels = vector_kernels();
-                   const double* rows = rows_in.data();
-                   const auto source = [&](std::size_t index, double* weights) {
-                       const double* row = rows + index * count;
-                       if (logarithms) return kernels.normalize(row, count, drop, weights);
-                       kernels.log(row, weights, count);
-                       return kernels.normalize(weights, count, drop, weights);
-                   };
-                   entropies(sets, posteriors, source, settings, out, counts);
-               }
-               return nb::make_tuple(
-                   result, counts.likelihoods, counts.visits,
-                   nb::make_tuple(counts.pair_by_pair, counts.own_tree, counts.grouped));
-           });
+    define(
+        module, "entropies",
+        [](const Input<2>& points, const Input<2>& rows_in, bool logarithms, int number,
+           std::uint32_t neighbors, double resolution, double exponent, double offset, int threads,
+           const std::vector<double>& factors, const Input<1>& prior, bool sampled) {
+            const std::size_t posteriors = rows_in.shape(0), count = rows_in.shape(1);
+            const PointSets sets = make_sets(points, count, factors);
+            double* out;
+            auto result = make_array<double>({posteriors}, out);
+            EntropyCounts counts;
+            const Estimator estimator = to_estimator(number);
+            const EntropySettings settings = make_settings(
+                estimator, neighbors, resolution, exponent, offset, threads, prior, count, sampled);
+            const bool drop = drops_negligible(estimator);
+            {
+                WithoutInterpreter released;
+                const VectorKernels& kernels = vector_kernels();
+                const double* rows = rows_in.data();
+                const auto source = [&](std::size_t index, double* weights) {
+                    const double* row = rows + index * count;
+                    if (logarithms) return kernels.normalize(row, count, drop, weights);
+                    kernels.log(row, weights, count);
+                    return kernels.normalize(weights, count, drop, weights);
+                };
+                entropies(sets, posteriors, source, settings, out, counts);
+            }
+            return nb::make_tuple(
+                result, counts.likelihoods, counts.visits,
+                nb::make_tuple(counts.pair_by_pair, counts.own_tree, counts.grouped));
+        });
 
     // Row r of the weights weighs points of its own, block r.
     define(

@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "deterministic_math.hpp"
+#include "point_sample.hpp"
 #include "point_tree.hpp"
 #include "prior_neighbors.hpp"
 #include "thread_pool.hpp"
@@ -30,9 +31,16 @@ constexpr std::size_t compact_limit = 24;
 constexpr double grouped_share = 0.12;
 constexpr double grouped_cost_of_a_point = 1000.0;
 constexpr double cost_of_making = 80.0;  // the tree and the group, of it
-// Points of a tree up to which its leaves are taken one by one, and beyond which in blocks: faster
-// where the points are dense, but sums are rounded otherwise, so this number may change bits.
-std::atomic<std::size_t> by_leaves_up_to{16384};
+// Points up to which all terms are added, and a tree's leaves are taken one by one. Beyond it the
+// terms are those of a sample, if the settings say so, and a tree's leaves are taken in blocks:
+// faster where the points are dense, but sums are rounded otherwise. So this number changes bits.
+std::atomic<std::size_t> few_up_to{16384};
+// Points in the sample for the groups of a batch, and in that for a posterior with its own tree.
+// They are chosen for 100,000 particles: a decision with the largest errors that still takes less
+// than a second of two threads (docs/decisions/many_entropies.md).
+constexpr double sample_of_groups = 2048.0;
+constexpr double sample_of_one = 512.0;
+constexpr double fewest_of_a_posterior = 128.0;
 // Nanoseconds for each likelihood, with the entropies that follow.
 constexpr double work_that_follows = 10.0;
 
@@ -72,6 +80,7 @@ struct Task {
     const EntropySettings* settings;
     NearestNeighborConstants constants;
     const VectorKernels* kernels;
+    bool sampled;  // the terms of a sample stand for all, where there are enough
 };
 
 std::uint32_t neighbors_among(const Task& task, std::size_t survivors) {
@@ -156,18 +165,25 @@ double compact_entropy(const Task& task, const double* weights, std::size_t surv
     return nearest(posterior, neighbors_among(task, survivors), task.constants, &visits);
 }
 
+/// A sample of about `size` points, or null if all terms are added.
+std::unique_ptr<PointSample> sample_of(const Task& task, const PointTree& tree,
+                                       const double* greatest, double size) {
+    if (!task.sampled || static_cast<double>(tree.count) < 2.0 * size) return nullptr;
+    return std::make_unique<PointSample>(tree, greatest, size, fewest_of_a_posterior);
+}
+
 /// Posteriors side by side over one tree; owns what PosteriorGroup points to.
 class Group {
   public:
     Group(const Task& task, const PointTree& tree, const std::vector<const double*>& weights,
-          const std::vector<std::size_t>& survivors)
+          const std::vector<std::size_t>& survivors, const PointSample* sample)
         : task_(task),
-          tree_(tree),
           members_(weights.size()),
-          leaves_of_piece_(tree.count > by_leaves_up_to &&
+          leaves_of_piece_((tree.count > few_up_to || sample != nullptr) &&
                                    task.settings->estimator == Estimator::nearest_neighbor
                                ? block_leaves
-                               : 1) {
+                               : 1),
+          leaves_(sample != nullptr ? sample->leaves() : tree.leaves) {
         const std::size_t vectors = (members_ + lane_count - 1) / lane_count;
         const std::size_t columns = vectors * lane_count;
         const std::size_t slots = tree.leaves * leaf_size;
@@ -219,7 +235,18 @@ class Group {
         for (std::size_t member = 0; member < members_; ++member) {
             neighbors_[member] = neighbors_among(task, survivors[member]);
         }
+        if (sample != nullptr) {
+            const SampleView view = sample->view();
+            sampled_.resize(columns);
+            for (std::size_t i = 0; i < view.count; ++i) {
+                for (std::size_t column = 0; column < columns; ++column) {
+                    sampled_[column] +=
+                        view.factors[i] * weights_[view.slots[i] * columns + column];
+                }
+            }
+        }
         view_ = {tree.view(),
+                 sample != nullptr ? sample->view() : SampleView{},
                  members_,
                  vectors,
                  weights_.data(),
@@ -234,7 +261,7 @@ class Group {
     }
 
     /// The leaves are worked on in so many pieces, from several threads at once.
-    std::size_t pieces() const { return (tree_.leaves + leaves_of_piece_ - 1) / leaves_of_piece_; }
+    std::size_t pieces() const { return (leaves_ + leaves_of_piece_ - 1) / leaves_of_piece_; }
 
     /// The terms of the points of a piece.
     void add_piece(std::size_t piece) {
@@ -249,8 +276,7 @@ class Group {
             task_.kernels->group_nearest(view_, leaf, task_.constants, scratch.data(), terms,
                                          visits);
         } else {
-            task_.kernels->block_nearest(view_, leaf,
-                                         std::min(leaves_of_piece_, tree_.leaves - leaf),
+            task_.kernels->block_nearest(view_, leaf, std::min(leaves_of_piece_, leaves_ - leaf),
                                          task_.constants, scratch.data(), terms, visits);
         }
     }
@@ -261,7 +287,7 @@ class Group {
         for (std::size_t piece = 0; piece < pieces(); ++piece) {
             sum += partial_[piece * view_.vectors * lane_count + member];
         }
-        return sum;
+        return sampled_.empty() ? sum : sum / sampled_[member];
     }
 
     std::uint64_t visits() const {
@@ -272,9 +298,9 @@ class Group {
 
   private:
     const Task& task_;
-    const PointTree& tree_;
-    std::size_t members_, leaves_of_piece_;
+    std::size_t members_, leaves_of_piece_, leaves_;
     std::vector<double> weights_, block_weights_, node_weights_;
+    std::vector<double> sampled_;  // of each member the weight in the sample; empty without one
     std::vector<std::uint32_t> significant_, block_counts_, node_counts_, neighbors_;
     std::vector<double> partial_;
     std::vector<std::uint64_t> visited_;
@@ -297,7 +323,8 @@ double own_tree_entropy(const Task& task, const double* weights, std::size_t sur
     own.points = points.data();
     own.count = survivors;
     const PointTree tree(own.points, own.count, own.dimension);
-    Group group(own, tree, {kept.data()}, {survivors});
+    const auto sample = sample_of(task, tree, kept.data(), sample_of_one);
+    Group group(own, tree, {kept.data()}, {survivors}, sample.get());
     for (std::size_t piece = 0; piece < group.pieces(); ++piece) group.add_piece(piece);
     visits += group.visits();
     return group.entropy(0);
@@ -305,8 +332,8 @@ double own_tree_entropy(const Task& task, const double* weights, std::size_t sur
 
 }  // namespace
 
-std::size_t use_blocks_beyond(std::size_t points) {
-    return by_leaves_up_to.exchange(points);
+std::size_t take_as_few_up_to(std::size_t points) {
+    return few_up_to.exchange(points);
 }
 
 void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSource& source,
@@ -320,7 +347,8 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
     std::vector<Task> tasks;
     for (std::size_t set = 0; set < sets.number; ++set) {
         tasks.push_back({sets.points + set * count * sets.dimension, count, sets.dimension,
-                         &settings, constants, &vector_kernels()});
+                         &settings, constants, &vector_kernels(),
+                         settings.sampled && count > few_up_to});
     }
     // Posteriors are taken in batches: their weights fill 64 MB, or those of one group if that is
     // more.
@@ -392,6 +420,14 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
                                                        : values[i] + settings.offset;
             }
         }
+        // One sample for all groups: what they have in common in its error favours none of them.
+        std::vector<std::unique_ptr<PointSample>> samples(sets.number);
+        std::vector<double> greatest(tasks[0].sampled ? count : 0);
+        for (std::size_t n = 0; n < greatest.size(); ++n) {
+            for (const std::size_t i : grouped) {
+                greatest[n] = std::max(greatest[n], weights[i * count + n]);
+            }
+        }
         const auto make_group = [&](std::size_t begin, std::size_t set) {
             const std::size_t end = std::min(begin + max_group_lanes, grouped.size());
             std::vector<const double*> members;
@@ -404,7 +440,10 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
             if (!trees[set]) {
                 trees[set] = std::make_unique<PointTree>(task.points, count, task.dimension);
             }
-            return std::make_unique<Group>(task, *trees[set], members, sizes);
+            if (begin == 0) {
+                samples[set] = sample_of(task, *trees[set], greatest.data(), sample_of_groups);
+            }
+            return std::make_unique<Group>(task, *trees[set], members, sizes, samples[set].get());
         };
         // The first groups are made while other threads work on posteriors alone.
         std::vector<std::unique_ptr<Group>> shared_groups(

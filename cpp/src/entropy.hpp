@@ -36,6 +36,7 @@ struct EntropySettings {
     double offset;            // added to every entropy (the mixture's constant terms)
     int threads;              // 0: all
     const double* prior;      // prior neighbours: [count], sum 1; else unused
+    bool sampled;             // of many points, a sample's terms stand for all (point_sample.hpp)
 };
 
 /// What was counted on the way, for benchmarks.
@@ -74,8 +75,8 @@ struct PointSets {
 void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSource& source,
                const EntropySettings& settings, double* out, EntropyCounts& counts);
 
-/// Sets the points of a tree beyond which its leaves are taken in blocks; returns how many there
-/// were. For tests.
-std::size_t use_blocks_beyond(std::size_t points);
+/// Sets up to how many points all terms are added, leaf by leaf; returns how many there were. For
+/// tests.
+std::size_t take_as_few_up_to(std::size_t points);
 
 }  // namespace holdfast

@@ -32,10 +32,21 @@ struct PosteriorInput {
     bool drop_negligible;
 };
 
+/// A sample of a tree's points, whose terms stand for those of all: in leaves of 16, as the tree's.
+struct SampleView {
+    std::size_t count;          // 0: every point of the tree is asked for
+    const double* coordinates;  // [leaves][dimension][16]
+    const double* low;          // [leaves][dimension], of the box around a leaf's points
+    const double* high;
+    const std::uint32_t* slots;  // [count] where the tree has them
+    const double* factors;       // [count] by which their weights are multiplied
+};
+
 /// Posteriors over the points of one tree, side by side: row = slot of the tree, column =
 /// posterior.
 struct PosteriorGroup {
     TreeView tree;
+    SampleView sample;
     std::size_t members;               // posteriors; the other columns of a row are zero
     std::size_t vectors;               // Lanes in a row, 1 to 4
     const double* weights;             // [slots][vectors * 8], each column sums to 1

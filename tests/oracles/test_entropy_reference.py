@@ -93,7 +93,10 @@ class Found(NamedTuple):
 
 
 def find(
-    points: FloatArray, weights: FloatArray, estimator: NearestNeighbor | GaussianMixture
+    points: FloatArray,
+    weights: FloatArray,
+    estimator: NearestNeighbor | GaussianMixture,
+    sampled: bool = False,
 ) -> Found:
     """Return what :func:`holdfast.planning.estimators.entropy` returns, with the ways to it."""
     kernel = kernel_estimator(estimator, points.shape[1])
@@ -105,6 +108,7 @@ def find(
         1,
         (1.0,),
         kernel.prior,
+        sampled,
     )
     return Found(result, visits, Ways(*ways))
 
@@ -116,11 +120,11 @@ BLOCKS_BEYOND = 16_384
 @contextmanager
 def in_blocks() -> Iterator[None]:
     """Let trees of any size be taken in blocks."""
-    assert _kernel.use_blocks_beyond(0) == BLOCKS_BEYOND
+    assert _kernel.take_as_few_up_to(0) == BLOCKS_BEYOND
     try:
         yield
     finally:
-        _kernel.use_blocks_beyond(BLOCKS_BEYOND)
+        _kernel.take_as_few_up_to(BLOCKS_BEYOND)
 
 
 def by_trees(posteriors: int) -> Ways:

@@ -84,7 +84,7 @@ def test_an_interruption_that_is_not_set_changes_no_decision() -> None:
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_kernel_ends_between_its_tasks(threads: int) -> None:
     points, rows = np.arange(600.0).reshape(200, 3), np.zeros((40, 200))
-    arguments = (points, rows, True, 0, 5, 1e-3, 0.0, 0.0, threads, (1.0,), np.empty(0))
+    arguments = (points, rows, True, 0, 5, 1e-3, 0.0, 0.0, threads, (1.0,), np.empty(0), True)
     expected = _kernel.entropies(*arguments)[0]
     interruption = Interruption()
     before = _kernel.use_threads_from(0.0)

@@ -92,33 +92,38 @@ for count, dimension, kept, posteriors, way in (
         for neighbors in (1, 5, 8, 9, 30):
             for resolution in (1e-9, 0.2, 20.0):
                 result, _, visits, ways = kernel.entropies(
-                    points, log_weights, True, 0, neighbors, resolution, 0.0, 0.0, 2, *alone)
+                    points, log_weights, True, 0, neighbors, resolution, 0.0, 0.0, 2, *alone, True)
                 name = f"nearest {count} {dimension} {kept} {deviation} {neighbors} {resolution}"
                 note(name, result, np.array(visits))
                 if deviation < 1.0 and ways[way] != posteriors:
                     wrong_ways.append(name)
     for exponent in (0.5, 0.125):
         result, _, visits, ways = kernel.entropies(
-            points * 3.0, normals * 0.4, True, 1, 1, 1.0, exponent, 0.3, 2, *alone)
+            points * 3.0, normals * 0.4, True, 1, 1, 1.0, exponent, 0.3, 2, *alone, True)
         name = f"mixture {count} {dimension} {kept} {exponent}"
         note(name, result, np.array(visits))
         if ways[way] != posteriors:
             wrong_ways.append(name)
 
-    usual = kernel.use_blocks_beyond(0)
+    usual = kernel.take_as_few_up_to(0)
     for resolution in (1e-9, 0.2, 2.0):
         result, _, visits, _ = kernel.entropies(
-            points, normals * 0.4, True, 0, 5, resolution, 0.0, 0.0, 2, *alone)
+            points, normals * 0.4, True, 0, 5, resolution, 0.0, 0.0, 2, *alone, True)
         note(f"blocks {count} {dimension} {kept} {resolution}", result, np.array(visits))
-    kernel.use_blocks_beyond(usual)
+    kernel.take_as_few_up_to(usual)
 
-    result, *_ = kernel.entropies(points, normals, True, 2, 1, 1.0, 0.0, 0.0, 2, *alone)
+    result, *_ = kernel.entropies(points, normals, True, 2, 1, 1.0, 0.0, 0.0, 2, *alone, True)
     note(f"variance {count} {dimension} {kept}", result)
     prior = np.full(count, 1.0 / count)
     for name, own in (("spread", points), ("few", np.round(points))):
-        result, *_ = kernel.entropies(own, normals, True, 3, 5, 0.1, 0.0, 0.0, 2, (1.0,), prior)
+        result, *_ = kernel.entropies(own, normals, True, 3, 5, 0.1, 0., 0., 2, (1.0,), prior, True)
         note(f"prior neighbours {count} {dimension} {kept} {name}", result)
 
+kernel.take_as_few_up_to(0)
+points, normals = stream.substream(7).normal((5000, 3)), stream.substream(8).normal((9, 5000))
+for kind, own in ((0, 1e-9), (0, 0.2), (0, 2.0), (1, 1.0)):
+    note(f"sample {kind} {own}", kernel.entropies(
+        points, normals, True, kind, 5, own, 0.5, 0.0, 2, *alone, True)[0])
 for count in (5, 100, 1001):
     draw = stream.substream(count)
     states = draw.normal((count, 3))
@@ -406,7 +411,7 @@ class TestThreads:
         results = set()
         for threads in (1, 2, 3, 64, 0):
             result, _, visits, ways = _kernel.entropies(
-                points, log_weights, True, estimator, 5, 0.1, 0.5, 0.0, threads, (1.0,), prior
+                points, log_weights, True, estimator, 5, 0.1, 0.5, 0.0, threads, (1.0,), prior, True
             )
             results.add((result.tobytes(), visits, ways))
             # The others have but one way.

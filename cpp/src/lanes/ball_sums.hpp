@@ -48,7 +48,7 @@ static void sum_balls(const PosteriorGroup& group, const QueryLeaf& query, doubl
     while (depth > 0) {
         const std::uint32_t at = stack[--depth];
         double least, greatest;
-        box_distances(tree, query.node, at, least, greatest);
+        box_distances(tree, query, at, least, greatest);
         if (least > radius_squared) continue;
         if (greatest <= radius_squared) {
             shared.add(group.node_weights + at * columns, group.node_counts + at * columns);
@@ -64,7 +64,7 @@ static void sum_balls(const PosteriorGroup& group, const QueryLeaf& query, doubl
         // The same two questions for each point of the leaf on its own, eight at a time.
         unsigned inside = 0, reached = 0;
         for (std::size_t v = 0; v < query_vectors; ++v) {
-            const PointDistances to_box = point_distances(tree, query.leaf, v, at);
+            const PointDistances to_box = point_distances(tree, query.coordinates, v, at);
             inside |= bits_of(to_box.greatest <= radius_squared) << (v * lane_count);
             reached |= bits_of(to_box.least <= radius_squared) << (v * lane_count);
         }
@@ -103,7 +103,7 @@ template <std::size_t vectors>
 static void ball_terms(const PosteriorGroup& group, const QueryLeaf& query, std::size_t i,
                        const Row<vectors>& row, const NearestNeighborConstants& constants,
                        double* scratch, Lanes* terms, std::uint64_t* visits) {
-    const std::size_t slot = query.first_slot + i;
+    const std::size_t slot = query.slots[i];
     const double log_ball = constants.log_ball_volume + static_cast<double>(group.tree.dimension) *
                                                             log_of(constants.resolution);
     for (std::size_t v = 0; v < vectors; ++v) {
@@ -115,10 +115,11 @@ static void ball_terms(const PosteriorGroup& group, const QueryLeaf& query, std:
             const std::size_t column = v * lane_count + lane;
             const std::uint32_t count = row.within[v][lane] - 1;
             terms[v][lane] +=
-                count >= group.neighbors[column]
-                    ? weight[lane] * (log_ball - log_mass[lane] + constants.bias_correction[count])
-                    : searched_term(group, query.points[i], slot, column, constants, scratch,
-                                    visits);
+                query.factors[i] *
+                (count >= group.neighbors[column]
+                     ? weight[lane] * (log_ball - log_mass[lane] + constants.bias_correction[count])
+                     : searched_term(group, query.points[i], slot, column, constants, scratch,
+                                     visits));
         }
     }
 }

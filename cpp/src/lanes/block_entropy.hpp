@@ -19,7 +19,8 @@ static unsigned list_terms(const PosteriorGroup& group, const QueryLeaf& query,
     const double resolution_squared = constants.resolution * constants.resolution * tie_tolerance;
     NearestLists<length> lists;
     // Where all lists would end within the resolution, all points need their balls.
-    if (!find_nearest(group.tree, query, lists, visits, resolution_squared)) {
+    if (!find_nearest(group.tree, query, lists, visits, resolution_squared,
+                      group.sample.count != 0)) {
         return (1u << query.used) - 1;
     }
     if (group.members == 1) {
@@ -65,15 +66,12 @@ static void block_nearest_rows(const PosteriorGroup& group, std::size_t first, s
     for (std::size_t m = 0; m < group.members; ++m) {
         if (group.neighbors[m] > most) most = group.neighbors[m];
     }
-    BlockQueries queries{first, {}, {}};
-    QueryLeaf query;
+    BlockQueries queries;
     for (std::size_t place = 0; place < leaves; ++place) {
-        open_leaf(group.tree, first + place, query);
-        queries.nodes[place] = query.node;
+        QueryLeaf& query = queries.leaves[place];
+        open_leaf(group.tree, group.sample, first + place, query);
         unsigned& open = queries.open[place];
-        double unused, diameter_squared;
-        box_distances(group.tree, query.node, query.node, unused, diameter_squared);
-        if (diameter_squared <= resolution_squared) {
+        if (squared_diameter(group.tree, query) <= resolution_squared) {
             open = (1u << query.used) - 1;
         } else if (group.members == 1 && most <= 8) {
             open = list_terms<vectors, 16>(group, query, constants, scratch, out, visits);
@@ -88,7 +86,7 @@ static void block_nearest_rows(const PosteriorGroup& group, std::size_t first, s
     Lanes terms[vectors];
     for (std::size_t v = 0; v < vectors; ++v) terms[v] = load(out + v * lane_count);
     for (std::size_t place = 0; place < leaves; ++place) {
-        open_leaf(group.tree, first + place, query);
+        const QueryLeaf& query = queries.leaves[place];
         for (unsigned left = queries.open[place]; left != 0; left &= left - 1) {
             const auto i = static_cast<std::size_t>(__builtin_ctz(left));
             ball_terms<vectors>(group, query, i, sums.row(place * leaf_size + i), constants,

@@ -164,11 +164,10 @@ struct BlockSums {
     }
 };
 
-/// Leaves of the tree, from `first` on, with points whose balls are summed.
+/// Leaves with points whose balls are summed.
 struct BlockQueries {
-    std::size_t first;
-    std::uint32_t nodes[block_leaves];
-    unsigned open[block_leaves];  // bits: these points
+    QueryLeaf leaves[block_leaves];
+    unsigned open[block_leaves] = {};  // bits: these points
 };
 
 /// Appends which points of leaf `at` of the tree lie within the balls around the open points of a
@@ -176,15 +175,14 @@ struct BlockQueries {
 static void cut_leaf(const TreeView& tree, const BlockQueries& queries, std::size_t place,
                      std::uint32_t at, double radius_squared, Cut*& cut, std::uint16_t*& around,
                      std::uint64_t* visits) {
-    const std::size_t leaf = queries.first + place;
+    const double* const own_leaf = queries.leaves[place].coordinates;
     unsigned inside = 0, reached = 0;
     for (std::size_t v = 0; v < query_vectors; ++v) {
-        const PointDistances to_box = point_distances(tree, leaf, v, at);
+        const PointDistances to_box = point_distances(tree, own_leaf, v, at);
         inside |= bits_of(to_box.greatest <= radius_squared) << (v * lane_count);
         reached |= bits_of(to_box.least <= radius_squared) << (v * lane_count);
     }
     const std::size_t first_point = place * leaf_size, size = tree.dimension * leaf_size;
-    const double* queries_at = tree.coordinates + leaf * size;
     const double* points = tree.coordinates + tree.nodes[at].first_leaf * size;
     for (unsigned left = inside & queries.open[place]; left != 0; left &= left - 1) {
         *around++ =
@@ -196,7 +194,7 @@ static void cut_leaf(const TreeView& tree, const BlockQueries& queries, std::siz
         Lanes distance[query_vectors] = {};
         for (std::size_t c = 0; c < tree.dimension; ++c) {
             const double* x = points + c * leaf_size;
-            const double own = queries_at[c * leaf_size + i];
+            const double own = own_leaf[c * leaf_size + i];
             for (std::size_t v = 0; v < query_vectors; ++v) {
                 const Lanes difference = load(x + v * lane_count) - own;
                 distance[v] += difference * difference;
@@ -219,14 +217,14 @@ static void sum_block(const PosteriorGroup& group, const BlockQueries& queries,
     constexpr std::size_t columns = vectors * lane_count;
     const TreeView& tree = group.tree;
     sums.clear();
-    Lanes low[max_dimension][block_vectors], high[max_dimension][block_vectors];
+    Lanes low[max_dimension][block_vectors] = {}, high[max_dimension][block_vectors] = {};
     unsigned all = 0;
     for (std::size_t place = 0; place < block_leaves; ++place) {
-        if (queries.open[place] != 0) all |= 1u << place;
+        if (queries.open[place] == 0) continue;
+        all |= 1u << place;
         for (std::size_t c = 0; c < tree.dimension; ++c) {
-            const std::size_t limit = queries.nodes[place] * tree.dimension + c;
-            low[c][place / lane_count][place % lane_count] = tree.low[limit];
-            high[c][place / lane_count][place % lane_count] = tree.high[limit];
+            low[c][place / lane_count][place % lane_count] = queries.leaves[place].low[c];
+            high[c][place / lane_count][place % lane_count] = queries.leaves[place].high[c];
         }
     }
     struct Pending {

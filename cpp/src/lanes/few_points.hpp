@@ -245,12 +245,14 @@ static double few_nearest(const CompactPosterior& posterior, std::uint32_t neigh
             if (!dense && (used & bits_of(within < static_cast<double>(few_list))) != 0) {
                 Lanes best[few_list];
                 sort_nearest(distances, order, ordered, used, best);
-                const auto weight_of = [&](std::size_t number) HOLDFAST_LAMBDA {
+                // The leaf's own points have the first numbers.
+                const auto weight_of = [&](std::size_t number, std::size_t lane) HOLDFAST_LAMBDA {
+                    if (number == v * lane_count + lane) return 0.0;
                     return posterior
                         .weights[order[number / leaf_size].leaf * leaf_size + number % leaf_size];
                 };
                 unsettled =
-                    walk_single<few_list>(best, __builtin_inf(), v * lane_count, weight_of, weight,
+                    walk_single<few_list>(best, __builtin_inf(), weight_of, weight, splat(1.0),
                                           neighbors, dimension, constants, by_lists);
             }
             if (unsettled == 0) continue;

@@ -20,15 +20,14 @@ static void group_nearest_rows(const PosteriorGroup& group, const QueryLeaf& que
                                const NearestNeighborConstants& constants, double* scratch,
                                double* out, std::uint64_t* visits) {
     const double resolution_squared = constants.resolution * constants.resolution * tie_tolerance;
-    double unused, diameter_squared;
-    box_distances(group.tree, query.node, query.node, unused, diameter_squared);
-    bool dense = diameter_squared <= resolution_squared;
+    bool dense = squared_diameter(group.tree, query) <= resolution_squared;
     bool summed = false;
     Row<vectors> rows[leaf_size];
     NearestLists<length> lists;
     Lanes wanted[vectors];  // the k of each column
     // Where all lists would end within the resolution, all points need their balls.
-    dense = dense || !find_nearest(group.tree, query, lists, visits, resolution_squared);
+    dense = dense || !find_nearest(group.tree, query, lists, visits, resolution_squared,
+                                   group.sample.count != 0);
     if (!dense) {
         for (std::size_t v = 0; v < vectors; ++v) {
             for (std::size_t lane = 0; lane < lane_count; ++lane) {
@@ -79,7 +78,7 @@ static void group_mixture_rows(const PosteriorGroup& group, std::size_t leaf, do
     const double reach_squared = 60.0 / exponent;
     const TreeView& tree = group.tree;
     QueryLeaf query;
-    open_leaf(tree, leaf, query);
+    open_leaf(tree, group.sample, leaf, query);
     Lanes totals[leaf_size][vectors] = {};
     std::uint32_t stack[stack_size];
     std::size_t depth = 0;
@@ -87,7 +86,7 @@ static void group_mixture_rows(const PosteriorGroup& group, std::size_t leaf, do
     while (depth > 0) {
         const std::uint32_t at = stack[--depth];
         double least, greatest;
-        box_distances(tree, query.node, at, least, greatest);
+        box_distances(tree, query, at, least, greatest);
         if (least > reach_squared) continue;
         const TreeNode& node = tree.nodes[at];
         if (node.left != 0) {
@@ -116,10 +115,9 @@ static void group_mixture_rows(const PosteriorGroup& group, std::size_t leaf, do
     }
     for (std::size_t i = 0; i < query.used; ++i) {
         for (std::size_t v = 0; v < vectors; ++v) {
-            const Lanes weight =
-                load(group.weights + (query.first_slot + i) * columns + v * lane_count);
+            const Lanes weight = load(group.weights + query.slots[i] * columns + v * lane_count);
             const Lanes term = select(weight > 0.0, weight * log_of(totals[i][v]), Lanes{});
-            store(out + v * lane_count, load(out + v * lane_count) - term);
+            store(out + v * lane_count, load(out + v * lane_count) - query.factors[i] * term);
         }
     }
 }
@@ -129,7 +127,7 @@ static void group_nearest_leaf(const PosteriorGroup& group, std::size_t leaf,
                                const NearestNeighborConstants& constants, double* scratch,
                                double* out, std::uint64_t* visits) {
     QueryLeaf query;
-    open_leaf(group.tree, leaf, query);
+    open_leaf(group.tree, group.sample, leaf, query);
     std::uint32_t most = 0;
     for (std::size_t m = 0; m < group.members; ++m) {
         if (group.neighbors[m] > most) most = group.neighbors[m];

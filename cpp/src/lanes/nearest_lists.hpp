@@ -93,10 +93,22 @@ static void renumber(NearestLists<length>& lists) {
     }
 }
 
+/// Whether a list may have room for a point of a node.
+template <std::size_t length>
+HOLDFAST_INLINE bool reaches(const TreeView& tree, const QueryLeaf& query,
+                             const NearestLists<length>& lists, std::size_t node) {
+    unsigned near = 0;
+    for (std::size_t v = 0; v < query_vectors; ++v) {
+        const PointDistances to_box = point_distances(tree, query.coordinates, v, node);
+        near |= bits_of(to_box.least < lists.keys[v][length - 1]);
+    }
+    return near != 0;
+}
+
 /// Fills the lists, or returns false once all of them reach no further than to `enough`.
 template <std::size_t length>
 static bool find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLists<length>& lists,
-                         std::uint64_t* visits, double enough = -1.0) {
+                         std::uint64_t* visits, double enough = -1.0, bool sampled = false) {
     struct Pending {
         std::uint32_t node;
         double least;
@@ -128,6 +140,8 @@ static bool find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLi
     while (depth > 0) {
         const Pending pending = stack[--depth];
         if (pending.least >= bound) continue;
+        // The points of a sample are far apart: what is near to their box may be near to none.
+        if (sampled && !reaches(tree, query, lists, pending.node)) continue;
         const TreeNode& node = tree.nodes[pending.node];
         if (!full && lists.candidates + leaf_size > max_candidates) {
             if (in_block > 0) merge();
@@ -141,10 +155,10 @@ static bool find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLi
         }
         if (node.left != 0) {
             double left_least, right_least, unused;
-            box_distances(tree, query.node, node.left, left_least, unused);
-            box_distances(tree, query.node, node.right, right_least, unused);
+            box_distances(tree, query, node.left, left_least, unused);
+            box_distances(tree, query, node.right, right_least, unused);
             // The nearer one on top; the query's own side, where both touch it.
-            const bool own_side_left = query.leaf < tree.nodes[node.left].last_leaf;
+            const bool own_side_left = query.slots[0] / leaf_size < tree.nodes[node.left].last_leaf;
             const bool left_first =
                 left_least != right_least ? left_least < right_least : own_side_left;
             if (left_first) {
@@ -166,9 +180,7 @@ static bool find_nearest(const TreeView& tree, const QueryLeaf& query, NearestLi
                     const double x =
                         tree.coordinates[(leaf * tree.dimension + c) * leaf_size + other];
                     const Lanes difference =
-                        load(tree.coordinates + (query.leaf * tree.dimension + c) * leaf_size +
-                             v * lane_count) -
-                        x;
+                        load(query.coordinates + c * leaf_size + v * lane_count) - x;
                     distance += difference * difference;
                 }
                 // Unused slots are at infinity from others and, as NaN, from each other.
@@ -198,7 +210,8 @@ static void walk_outwards(const PosteriorGroup& group, const QueryLeaf& query, s
     constexpr std::size_t columns = vectors * lane_count;
     const TreeView& tree = group.tree;
     const double resolution_squared = constants.resolution * constants.resolution * tie_tolerance;
-    const std::size_t slot = query.first_slot + i;
+    const std::size_t slot = query.slots[i];
+    const double factor = query.factors[i];
     const double* own_weights = group.weights + slot * columns;
     Lanes mass[vectors] = {}, within[vectors] = {}, radius[vectors];
     for (std::size_t v = 0; v < vectors; ++v) {
@@ -234,28 +247,29 @@ static void walk_outwards(const PosteriorGroup& group, const QueryLeaf& query, s
             if (!(weight[lane] > 0.0)) continue;
             const std::size_t column = v * lane_count + lane;
             if (!(radius[v][lane] < limit)) {
-                terms[v][lane] +=
-                    searched_term(group, query.points[i], slot, column, constants, scratch, visits);
+                terms[v][lane] += factor * searched_term(group, query.points[i], slot, column,
+                                                         constants, scratch, visits);
                 continue;
             }
             const std::uint32_t q = radius[v][lane] > resolution_squared
                                         ? group.neighbors[column]
                                         : static_cast<std::uint32_t>(within[v][lane]);
             terms[v][lane] +=
-                weight[lane] * (constants.log_ball_volume +
-                                static_cast<double>(tree.dimension) * log_radius[lane] -
-                                log_mass[lane] + constants.bias_correction[q]);
+                factor * (weight[lane] * (constants.log_ball_volume +
+                                          static_cast<double>(tree.dimension) * log_radius[lane] -
+                                          log_mass[lane] + constants.bias_correction[q]));
         }
     }
 }
 
 /// The terms of eight points under a single posterior, side by side instead of eight posteriors.
-/// Adds what their sorted lists settle to `sum`, and tells by bits which points they do not. A
-/// point's own number is `first` and its lane.
+/// Adds what their sorted lists settle to `sum`, times the points' factors, and tells by bits which
+/// points they do not. `weight_of` a number is zero for the point of a lane itself.
 template <std::size_t length, class WeightOf>
-HOLDFAST_INLINE unsigned walk_single(const Lanes* keys, double complete_below, std::size_t first,
+HOLDFAST_INLINE unsigned walk_single(const Lanes* keys, double complete_below,
                                      const WeightOf& weight_of, const Lanes& own_weight,
-                                     std::uint32_t neighbors, std::size_t dimension,
+                                     const Lanes& factors, std::uint32_t neighbors,
+                                     std::size_t dimension,
                                      const NearestNeighborConstants& constants, double& sum) {
     const double resolution_squared = constants.resolution * constants.resolution * tie_tolerance;
     const Lanes last = detail::from_bits<Lanes>(detail::bits(keys[length - 1]) & ~number_bits);
@@ -271,7 +285,7 @@ HOLDFAST_INLINE unsigned walk_single(const Lanes* keys, double complete_below, s
         for (std::size_t lane = 0; lane < lane_count; ++lane) {
             if ((bits >> lane & 1) == 0) continue;
             const auto number = static_cast<std::size_t>(detail::bits(key[lane]) & number_bits);
-            if (number != first + lane) weight[lane] = weight_of(number);
+            weight[lane] = weight_of(number, lane);
         }
         const IntLanes open = (distance <= radius) & (weight > 0.0);
         mass += select(open, weight, Lanes{});
@@ -290,24 +304,27 @@ HOLDFAST_INLINE unsigned walk_single(const Lanes* keys, double complete_below, s
         const std::uint32_t q = radius[lane] > resolution_squared
                                     ? neighbors
                                     : static_cast<std::uint32_t>(within[lane]);
-        sum += own_weight[lane] * (spread[lane] + constants.bias_correction[q]);
+        sum += factors[lane] * (own_weight[lane] * (spread[lane] + constants.bias_correction[q]));
     }
     return bits_of(own_weight > 0.0) & ~settled;
 }
 
-/// Of eight points of a leaf, whose own leaf was the first one visited.
+/// Of eight points of a leaf.
 template <std::size_t length>
 static unsigned walk_single(const PosteriorGroup& group, const QueryLeaf& query, std::size_t v,
                             const NearestLists<length>& lists,
                             const NearestNeighborConstants& constants, double& sum) {
-    const double* const own = group.weights + (query.first_slot + v * lane_count) * lane_count;
-    Lanes weight;
-    for (std::size_t lane = 0; lane < lane_count; ++lane) weight[lane] = own[lane * lane_count];
-    const auto weight_of = [&](std::size_t number) HOLDFAST_LAMBDA {
-        return group.weights[lists.slots[number] * lane_count];
+    Lanes weight{}, factors{};
+    for (std::size_t lane = 0; lane < lane_count && v * lane_count + lane < query.used; ++lane) {
+        weight[lane] = group.weights[query.slots[v * lane_count + lane] * lane_count];
+        factors[lane] = query.factors[v * lane_count + lane];
+    }
+    const auto weight_of = [&](std::size_t number, std::size_t lane) HOLDFAST_LAMBDA {
+        const std::uint32_t slot = lists.slots[number];
+        return slot == query.slots[v * lane_count + lane] ? 0.0 : group.weights[slot * lane_count];
     };
-    return walk_single<length>(lists.keys[v], lists.complete_below, v * lane_count, weight_of,
-                               weight, group.neighbors[0], group.tree.dimension, constants, sum);
+    return walk_single<length>(lists.keys[v], lists.complete_below, weight_of, weight, factors,
+                               group.neighbors[0], group.tree.dimension, constants, sum);
 }
 
 }  // namespace holdfast::inline HOLDFAST_ISA

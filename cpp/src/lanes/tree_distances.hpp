@@ -30,15 +30,7 @@ HOLDFAST_INLINE void box_distances(std::size_t dimension, const double* a_low, c
     }
 }
 
-/// Those between the boxes of two nodes.
-HOLDFAST_INLINE void box_distances(const TreeView& tree, std::size_t a, std::size_t b,
-                                   double& least, double& greatest) {
-    const std::size_t own = a * tree.dimension, other = b * tree.dimension;
-    box_distances(tree.dimension, tree.low + own, tree.high + own, tree.low + other,
-                  tree.high + other, least, greatest);
-}
-
-/// The same from one point to the box of a node; only the least distance is wanted.
+/// Least squared distance from one point to the box of a node.
 HOLDFAST_INLINE double point_to_box(const TreeView& tree, const double* point, std::size_t node) {
     double least = 0.0;
     for (std::size_t c = 0; c < tree.dimension; ++c) {
@@ -71,13 +63,13 @@ struct PointDistances {
     }
 };
 
-HOLDFAST_INLINE PointDistances point_distances(const TreeView& tree, std::size_t leaf,
+/// From eight points of a leaf with these coordinates, [dimension][leaf_size].
+HOLDFAST_INLINE PointDistances point_distances(const TreeView& tree, const double* coordinates,
                                                std::size_t v, std::size_t node) {
     PointDistances result{};
     for (std::size_t c = 0; c < tree.dimension; ++c) {
-        result.add(
-            load(tree.coordinates + (leaf * tree.dimension + c) * leaf_size + v * lane_count),
-            tree.low[node * tree.dimension + c], tree.high[node * tree.dimension + c]);
+        result.add(load(coordinates + c * leaf_size + v * lane_count),
+                   tree.low[node * tree.dimension + c], tree.high[node * tree.dimension + c]);
     }
     return result;
 }
@@ -95,30 +87,59 @@ HOLDFAST_INLINE Lanes leaf_distances(const TreeView& tree, const double* point, 
     return distance;
 }
 
-/// A leaf whose points are the centres of the balls and lists that are asked for.
+/// A leaf whose points are the centres of the balls and lists that are asked for: one of the tree,
+/// or of a sample of its points.
 struct QueryLeaf {
-    std::size_t leaf;
-    std::uint32_t node;
-    std::size_t first_slot;
     std::size_t used;
+    const double* coordinates;  // [dimension][leaf_size]
+    const double* low;          // of the box around the points
+    const double* high;
+    std::uint32_t slots[leaf_size];  // in the tree
+    double factors[leaf_size];       // by which the terms are multiplied
     double points[leaf_size][max_dimension];
 };
 
-HOLDFAST_INLINE void open_leaf(const TreeView& tree, std::size_t leaf, QueryLeaf& query) {
-    query.leaf = leaf;
-    query.node = 0;
-    while (tree.nodes[query.node].left != 0) {
-        const TreeNode& node = tree.nodes[query.node];
-        query.node = leaf < tree.nodes[node.left].last_leaf ? node.left : node.right;
-    }
-    query.first_slot = leaf * leaf_size;
-    const std::size_t left = tree.count - query.first_slot;
+HOLDFAST_INLINE void open_leaf(const TreeView& tree, const SampleView& sample, std::size_t leaf,
+                               QueryLeaf& query) {
+    const std::size_t first = leaf * leaf_size;
+    const bool sampled = sample.count != 0;
+    const std::size_t left = (sampled ? sample.count : tree.count) - first;
     query.used = left < leaf_size ? left : leaf_size;
+    query.coordinates = (sampled ? sample.coordinates : tree.coordinates) + first * tree.dimension;
+    if (sampled) {
+        query.low = sample.low + leaf * tree.dimension;
+        query.high = sample.high + leaf * tree.dimension;
+    } else {
+        std::size_t at = 0;
+        while (tree.nodes[at].left != 0) {
+            const TreeNode& node = tree.nodes[at];
+            at = leaf < tree.nodes[node.left].last_leaf ? node.left : node.right;
+        }
+        query.low = tree.low + at * tree.dimension;
+        query.high = tree.high + at * tree.dimension;
+    }
     for (std::size_t i = 0; i < query.used; ++i) {
+        query.slots[i] = sampled ? sample.slots[first + i] : static_cast<std::uint32_t>(first + i);
+        query.factors[i] = sampled ? sample.factors[first + i] : 1.0;
         for (std::size_t c = 0; c < tree.dimension; ++c) {
-            query.points[i][c] = tree.coordinates[(leaf * tree.dimension + c) * leaf_size + i];
+            query.points[i][c] = query.coordinates[c * leaf_size + i];
         }
     }
+}
+
+/// Least and greatest squared distance between the points of a leaf and a node.
+HOLDFAST_INLINE void box_distances(const TreeView& tree, const QueryLeaf& query, std::size_t node,
+                                   double& least, double& greatest) {
+    const std::size_t other = node * tree.dimension;
+    box_distances(tree.dimension, query.low, query.high, tree.low + other, tree.high + other, least,
+                  greatest);
+}
+
+/// The greatest squared distance between the corners of a leaf's box.
+HOLDFAST_INLINE double squared_diameter(const TreeView& tree, const QueryLeaf& query) {
+    double unused, diameter;
+    box_distances(tree.dimension, query.low, query.high, query.low, query.high, unused, diameter);
+    return diameter;
 }
 
 }  // namespace holdfast::inline HOLDFAST_ISA

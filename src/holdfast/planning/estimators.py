@@ -398,7 +398,7 @@ def entropy(
     kernel = kernel_estimator(estimator, array.shape[1])
     array = scaled(array, kernel)
     result, _, _, _ = _kernel.entropies(
-        array, rows, False, *kernel.parameters, threads, (1.0,), kernel.prior
+        array, rows, False, *kernel.parameters, threads, (1.0,), kernel.prior, False
     )
     if kernel.log_volume != 0.0:
         result = result + kernel.log_volume

@@ -437,6 +437,7 @@ class _GeneralHypotheses(NamedTuple):
             threads,
             factors,
             estimator.prior,
+            True,
         )
         samples = found[: len(self.log_weights)].reshape(-1, self.samples)
         means = _row_means(samples)

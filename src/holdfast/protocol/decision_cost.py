@@ -137,6 +137,8 @@ _NEAREST_ALONE, _NEAREST_TOGETHER, _GROUP = 420.0, 90.0, 32
 """For a point's neighbours in one posterior alone, and in one of a group of this size."""
 _NEIGHBOR, _SQUARED_NEIGHBOR = 50.0, 0.17
 """For each neighbour beyond five; many are kept in order, so the square counts too."""
+_FEW, _SAMPLE, _SAMPLED_PAIR, _SAMPLED_WEIGHT = 16_384.0, 2048.0, 1.2, 15.0
+"""Of more particles, terms that stand for all; for a pair of one and a particle; for a weight."""
 _MIXTURE_PAIR = 0.28
 _PRIOR_PAIR, _PRIOR_MEMBER, _PRIOR_LANES = 4.0, 4.0, 8
 _ADD = 2.0
@@ -228,6 +230,8 @@ class _Sizes:
         kind = estimator_of(selector, int(particles))
         neighbors = min(float(self.planning.active_sensing.num_nearest_neighbors), particles)
         wide = 1.0 + max(0.0, dimension - 3.0) / 3.0
+        terms = particles if particles <= _FEW else _SAMPLE
+        groups = math.ceil(posteriors / _GROUP)
         if kind == "nearest_neighbor":
             together = min(posteriors, float(_GROUP))
             point = _NEAREST_TOGETHER + (_NEAREST_ALONE - _NEAREST_TOGETHER) / together
@@ -235,7 +239,10 @@ class _Sizes:
             point *= 1.0 + math.log2(1.0 + particles / 1000.0) / 2.0
             point += _NEIGHBOR * max(0.0, neighbors - 5.0)
             point += _SQUARED_NEIGHBOR * neighbors * neighbors
-            found = posteriors * sets * particles * point * wide
+            found = posteriors * sets * terms * point * wide
+            if terms < particles:
+                weight = _SAMPLED_WEIGHT * posteriors + _SAMPLED_PAIR * groups * terms
+                found += sets * particles * weight
         elif kind in PRIOR_ESTIMATORS:
             pair = _PRIOR_PAIR + min(0.45 * neighbors, 9.0 * math.log2(1.0 + neighbors))
             pieces = math.ceil(posteriors / _PRIOR_LANES)
@@ -245,8 +252,7 @@ class _Sizes:
                 + pieces * (_PRIOR_MEMBER * members + 20.0 * _PRIOR_LANES * particles)
             )
         else:
-            groups = math.ceil(posteriors / _GROUP)
-            pairs = particles * particles * sets * groups * _GROUP
+            pairs = terms * particles * sets * groups * _GROUP
             found = (pairs * _MIXTURE_PAIR + posteriors * sets * particles * 100.0) * wide
         return (found + sets * particles * 400.0) * self.unit_s
 

@@ -57,7 +57,7 @@ def measure_slowness() -> float:
 
 def _work(points: FloatArray, rows: FloatArray, estimator: KernelEstimator) -> None:
     """Compute as a decision does: half of it in the kernel, half in Python and NumPy."""
-    _kernel.entropies(points, rows, True, *estimator.parameters, 1, (1.0,), estimator.prior)
+    _kernel.entropies(points, rows, True, *estimator.parameters, 1, (1.0,), estimator.prior, True)
     for row in rows:
         for _ in range(4):
             np.searchsorted(np.cumsum(row), row[:8])
