@@ -190,14 +190,7 @@ class _World(KeepsReadOnly):
         states_at = np.empty((*shape, self.dimension))
         stages_at = np.empty(shape, dtype=np.int64)
         followed = self._kernel.own.follow(
-            policy,
-            states,
-            stage,
-            offsets,
-            tolerance,
-            threads,
-            states_at,
-            stages_at,
+            policy, states, stage, offsets, tolerance, threads, states_at, stages_at
         )
         if not followed:
             _raise_not_finite("states", states)
