@@ -34,7 +34,7 @@ PACKAGE_SOURCES := $(shell find cmake src lab/src -type f -not -name '*.pyc') la
 CPP_FILES := $(shell find cpp -name '*.hpp' -o -name '*.cpp')
 
 .DEFAULT_GOAL := help
-.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-slow test-ros test-ros1 test-compiled lint lint-forge format simulate chaos fuzz soak mutants bench results docs docs-links wheel sbom release-rehearsal requirements clean
+.PHONY: help demo install test test-gate test-real test-defects test-slow test-deploy test-deploy-engine test-deploy-others test-deploy-slow test-ros test-ros1 test-compiled lint lint-forge format simulate chaos fuzz soak mutants bench results docs docs-links wheel sbom release-rehearsal requirements clean
 
 help: ## what there is to make
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -73,7 +73,17 @@ test-compiled: $(INSTALLED_COMPILED) ## the simulator's tests and 10,000 seeds t
 	    tests/processes/test_compiled.py
 
 test-deploy: $(INSTALLED_DEV) ## images, tunnels and machines; root, and packages that .ci/run installs
-	$(BIN)/pytest -q $(LONG) -n 2 --dist loadgroup --durations=12 -m "deploy and not slow" tests/deploy
+	$(MAKE) --no-print-directory -j2 -Otarget test-deploy-engine test-deploy-others
+
+# What needs the engine, so that there is one; and what waits beside it.
+ENGINE_TESTS := $(patsubst %,tests/deploy/test_%.py,compose deploy_page images machine wheel)
+DEPLOY = $(BIN)/pytest -q $(LONG) --durations=8 -m "deploy and not slow"
+
+test-deploy-engine: $(INSTALLED_DEV)
+	$(DEPLOY) $(ENGINE_TESTS)
+
+test-deploy-others: $(INSTALLED_DEV)
+	$(DEPLOY) $(ENGINE_TESTS:%=--ignore=%) tests/deploy
 
 test-deploy-slow: $(INSTALLED_DEV) ## those of them that take minutes
 	$(BIN)/pytest -q $(LONG) -m "deploy and slow" tests/deploy

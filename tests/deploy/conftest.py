@@ -7,14 +7,6 @@ from tests.deploy.docker import Engine, Images, build, running_engine
 from tests.processes.conftest import references, site  # noqa: F401 - fixtures
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the marks
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put what needs the engine on one worker, so that there is one engine; the rest on another."""
-    for item in items:
-        group = "engine" if "engine" in getattr(item, "fixturenames", ()) else "no engine"
-        item.add_marker(pytest.mark.xdist_group(group))
-
-
 @pytest.fixture(scope="session")
 def engine() -> Iterator[Engine]:
     """Return a Docker Engine."""
