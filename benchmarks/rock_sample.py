@@ -256,7 +256,7 @@ PLANNERS: Mapping[str, dict[str, Any]] = {
     "POMCP": {"depth": 20, "exploration_constant": 5.0, "n_simulations": 4000},
     "POMCPOW": {
         "depth": 20,
-        "exploration_constant": 20.0,
+        "exploration_constant": 5.0,
         "n_simulations": 10_000,
         "k_a": len(ROCKS) + 4.5,
         "alpha_a": 0.0,
