@@ -17,12 +17,12 @@ def test_results_and_errors_of_coroutines_come_back() -> None:
         return threading.current_thread().name
 
     async def fail() -> None:
-        raise ValueError("a defect")
+        raise TimeoutError("of its own")
 
     thread = LoopThread("the-loop")
     assert thread.run(name(), PATIENCE_S) == "the-loop"
-    with pytest.raises(ValueError, match="a defect"):
-        thread.run(fail(), PATIENCE_S)
+    with pytest.raises(TimeoutError, match="of its own"):
+        thread.run(fail())
     thread.close(PATIENCE_S)
 
 

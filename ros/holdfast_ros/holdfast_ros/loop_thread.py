@@ -34,11 +34,12 @@ class LoopThread:
             coroutine.close()
             raise TransportError("it is closed") from None
         try:
-            wait((future, self._ended), within_s, FIRST_COMPLETED)  # a closing loop runs none
-            return future.result(0.0)
-        except TimeoutError:
-            text = "it is closed" if self._ended.done() else f"it took longer than {within_s:g} s"
-            raise TransportError(text) from None
+            # A closing loop runs none.
+            done, _ = wait((future, self._ended), within_s, FIRST_COMPLETED)
+            if future in done:
+                return future.result()
+            text = "it is closed" if self._ended in done else f"it took longer than {within_s:g} s"
+            raise TransportError(text)
         except CancelledError:
             raise TransportError("it is closed") from None
         finally:
