@@ -34,8 +34,7 @@ class LoopThread:
             coroutine.close()
             raise TransportError("it is closed") from None
         try:
-            # A closing loop runs none.
-            done, _ = wait((future, self._ended), within_s, FIRST_COMPLETED)
+            done, _ = wait((future, self._ended), within_s, FIRST_COMPLETED)  # closing runs none
             if future in done:
                 return future.result()
             text = "it is closed" if self._ended in done else f"it took longer than {within_s:g} s"
