@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Self
 
 PATIENCE_S = 60.0
+_MARK = b"X_HEARD_UP_TO_HERE=1"
 
 
 class NotifySocket:
@@ -24,6 +25,7 @@ class NotifySocket:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(f"\0{name}" if abstract else path)
         self._messages: list[list[str]] = []
+        self._marks = 0
         self._heard = threading.Condition()
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
@@ -49,8 +51,18 @@ class NotifySocket:
         # Shut down, it has an empty message; nobody sends one.
         while data := self._socket.recv(65536):
             with self._heard:
-                self._messages.append(data.decode().split("\n"))
+                if data == _MARK:
+                    self._marks += 1
+                else:
+                    self._messages.append(data.decode().split("\n"))
                 self._heard.notify_all()
+
+    def hear_out(self) -> None:
+        """Wait until everything that was sent before this call has been heard."""
+        with self._heard, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            wanted = self._marks + 1
+            sender.sendto(_MARK, self._socket.getsockname())
+            assert self._heard.wait_for(lambda: self._marks >= wanted, PATIENCE_S)
 
     @property
     def messages(self) -> list[list[str]]:

@@ -73,7 +73,8 @@ def variables_of(pid: int) -> set[str]:
 
 
 def beats_in(manager: NotifySocket, seconds: float) -> int:
-    """Return how often it was told in that time that a loop moves."""
+    """Return how often it is told from now on, in that time, that a loop moves."""
+    manager.hear_out()
     before = manager.count("WATCHDOG=1")
     time.sleep(seconds)
     return manager.count("WATCHDOG=1") - before
