@@ -77,16 +77,16 @@ test-deploy: $(INSTALLED_DEV) ## images, tunnels and machines; root, and package
 
 # What needs the engine, so that there is one; and what waits beside it.
 ENGINE_TESTS := $(patsubst %,tests/deploy/test_%.py,compose deploy_page images machine wheel)
-DEPLOY = $(BIN)/pytest -q $(LONG) --durations=8 -m "deploy and not slow"
+DEPLOY = $(BIN)/pytest -q $(LONG) --durations=8
 
 test-deploy-engine: $(INSTALLED_DEV)
-	$(DEPLOY) $(ENGINE_TESTS)
+	$(DEPLOY) -m "deploy and not slow" $(ENGINE_TESTS)
 
 test-deploy-others: $(INSTALLED_DEV)
-	$(DEPLOY) $(ENGINE_TESTS:%=--ignore=%) tests/deploy
+	$(DEPLOY) -m "deploy and not slow" $(ENGINE_TESTS:%=--ignore=%) tests/deploy
 
 test-deploy-slow: $(INSTALLED_DEV) ## those of them that take minutes
-	$(BIN)/pytest -q $(LONG) -m "deploy and slow" tests/deploy
+	$(DEPLOY) -m "deploy and slow" tests/deploy
 
 test-ros: $(INSTALLED_DEV) ## a real ROS 1, and ROS 2 Kilted and Jazzy, which tests/ros/set_up_ros2 installs the first time
 	tests/ros/set_up_ros2 $(ROS2) $(PYTHON)

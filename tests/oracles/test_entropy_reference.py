@@ -113,18 +113,18 @@ def find(
     return Found(result, visits, Ways(*ways))
 
 
-BLOCKS_BEYOND = 16_384
-"""Points in a tree beyond which it is taken in blocks."""
+FEW_UP_TO = 16_384
+"""Points up to which all terms are added, leaf by leaf."""
 
 
 @contextmanager
 def in_blocks() -> Iterator[None]:
     """Let trees of any size be taken in blocks."""
-    assert _kernel.take_as_few_up_to(0) == BLOCKS_BEYOND
+    assert _kernel.take_as_few_up_to(0) == FEW_UP_TO
     try:
         yield
     finally:
-        _kernel.take_as_few_up_to(BLOCKS_BEYOND)
+        _kernel.take_as_few_up_to(FEW_UP_TO)
 
 
 def by_trees(posteriors: int) -> Ways:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from tests.oracles import test_entropy_reference as small
-from tests.oracles.test_entropy_reference import BLOCKS_BEYOND as LIMIT
+from tests.oracles.test_entropy_reference import FEW_UP_TO as LIMIT
 from tests.oracles.test_entropy_reference import TOLERANCE, draw_weights, find
 
 from holdfast import _kernel

@@ -34,10 +34,10 @@ class LoopThread:
             coroutine.close()
             raise TransportError("it is closed") from None
         try:
-            done, _ = wait((future, self._ended), within_s, FIRST_COMPLETED)  # closing runs none
-            if future in done:
+            wait((future, self._ended), within_s, FIRST_COMPLETED)  # an ended loop runs none
+            if future.done():
                 return future.result()
-            text = "it is closed" if self._ended in done else f"it took longer than {within_s:g} s"
+            text = "it is closed" if self._ended.done() else f"it took longer than {within_s:g} s"
             raise TransportError(text)
         except CancelledError:
             raise TransportError("it is closed") from None
