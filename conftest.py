@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import faulthandler
+import gc
 import inspect
 import os
 import signal
@@ -211,6 +212,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.deploy)
         if place.startswith(ROS):
             item.add_marker(pytest.mark.ros)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish() -> None:
+    """Let no search for garbage look through all tests again: that took 5 % of their time."""
+    gc.collect()
+    gc.freeze()
 
 
 _path: list[str] = []  # where a test begins to look for modules

@@ -1,17 +1,16 @@
-"""The entropy estimates, written for reading: one point, one neighbour at a time.
+"""The entropy estimates, written for reading: all points with all.
 
 Shares no code with the kernel; SciPy's digamma, NumPy's sorting.
 """
 
 import math
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import digamma
 
-from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.arrays import FloatArray
 
 
 def significant(weights: FloatArray) -> npt.NDArray[np.bool_]:
@@ -33,41 +32,40 @@ def log_unit_ball(dimension: int) -> float:
     return float(0.5 * dimension * math.log(math.pi) - math.lgamma(0.5 * dimension + 1.0))
 
 
-class Neighborhood(NamedTuple):
-    """What lies about one point."""
+class Neighborhoods(NamedTuple):
+    """What lies about each point: a row for each, and a column for each that may lie there."""
 
-    within: IntArray
-    others: IntArray
-    terms: float
+    within: npt.NDArray[np.bool_]
+    terms: FloatArray
+
+    def shares(self, weights: FloatArray, own: float = 0.0) -> FloatArray:
+        """Return the weight within, of that of all other points, both with a part of their own."""
+        others = ~np.eye(len(weights), dtype=bool)
+        near, all_others = (
+            np.where(each, weights, 0.0).sum(axis=1) + own * weights
+            for each in (self.within, others)
+        )
+        return np.asarray(near / all_others)
 
 
-def neighborhoods(
-    points: FloatArray, neighbors: int, resolution: float
-) -> Iterator[tuple[int, Neighborhood]]:
-    """Yield each of two or more points with its neighbourhood."""
+def neighborhoods(points: FloatArray, neighbors: int, resolution: float) -> Neighborhoods:
+    """Return the neighbourhoods of two or more points."""
     count, dimension = points.shape
     k = min(neighbors, count - 1)
-    for n in range(count):
-        others = np.delete(np.arange(count), n)
-        # Squares compared with squares, as a radius that is a square root would move ties apart.
-        squared = np.zeros(count)
-        for coordinate in range(dimension):
-            squared += (points[:, coordinate] - points[n, coordinate]) ** 2
-        squared = squared[others]
-        kth = np.partition(squared, k - 1)[k - 1]
-        # Distances that differ by rounding alone are equal.
-        tolerance = 1.0 + 2.0**-40
-        resolved = kth > resolution * resolution * tolerance
-        radius_squared = (kth if resolved else resolution * resolution) * tolerance
-        within = others[squared <= radius_squared]
-        q = k if resolved else len(within)
-        terms = (
-            log_unit_ball(dimension)
-            + 0.5 * dimension * math.log(radius_squared)
-            + math.log(q)
-            - digamma(q)
-        )
-        yield n, Neighborhood(within, others, float(terms))
+    # Squares compared with squares, as a radius that is a square root would move ties apart.
+    squared = np.zeros((count, count))
+    for coordinates in points.T:
+        squared += (coordinates[:, np.newaxis] - coordinates) ** 2
+    np.fill_diagonal(squared, np.inf)
+    kth = np.partition(squared, k - 1)[:, k - 1]
+    # Distances that differ by rounding alone are equal.
+    tolerance = 1.0 + 2.0**-40
+    resolved = kth > resolution * resolution * tolerance
+    radius_squared = np.where(resolved, kth, resolution * resolution) * tolerance
+    within = squared <= radius_squared[:, np.newaxis]
+    q = np.where(resolved, k, within.sum(axis=1))
+    terms = 0.5 * dimension * np.log(radius_squared) + np.log(q) - digamma(q)
+    return Neighborhoods(within, log_unit_ball(dimension) + terms)
 
 
 def single_point_entropy(dimension: int, resolution: float) -> float:
@@ -81,13 +79,8 @@ def nearest_neighbor_entropy(
     points, weights = points[kept], weights[kept] / weights[kept].sum()
     if len(points) == 1:
         return single_point_entropy(points.shape[1], resolution)
-    return float(
-        sum(
-            weights[n]
-            * (near.terms - math.log(weights[near.within].sum() / weights[near.others].sum()))
-            for n, near in neighborhoods(points, neighbors, resolution)
-        )
-    )
+    near = neighborhoods(points, neighbors, resolution)
+    return float((weights * (near.terms - np.log(near.shares(weights)))).sum())
 
 
 def prior_neighbors_entropy(
@@ -98,15 +91,11 @@ def prior_neighbors_entropy(
     points, weights, prior = points[prior > 0.0], weights[prior > 0.0], prior[prior > 0.0]
     if len(points) == 1:
         return single_point_entropy(points.shape[1], resolution)
-    total = 0.0
-    for n, (within, others, terms) in neighborhoods(points, neighbors, resolution):
-        total += prior[n] * (terms - math.log(prior[within].sum() / prior[others].sum()))
-        if weights[n] > 0.0:
-            before, after = (
-                (w[within].sum() + 0.05 * w[n]) / (w[others].sum() + 0.05 * w[n])
-                for w in (prior, weights)
-            )
-            total -= weights[n] * math.log(after / before)
+    near = neighborhoods(points, neighbors, resolution)
+    total = (prior * (near.terms - np.log(near.shares(prior)))).sum()
+    counts = weights > 0.0
+    changes = near.shares(weights, 0.05)[counts] / near.shares(prior, 0.05)[counts]
+    total -= (weights[counts] * np.log(changes)).sum()
     return float(total)
 
 

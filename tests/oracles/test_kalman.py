@@ -4,7 +4,7 @@ The filter is the one that plans: `Planner.observe` and `Planner.advance` on a p
 of two dimensions. Its belief of N particles errs from the exact one by O(1 / sqrt N) at random and
 by O(1 / N) in the mean, at every step, because it forgets. So the errors of independent runs on the
 same observations are a sample of mean zero up to 10 / N, in units of the exact deviation: a t-test
-with their own spread, failed by a right filter with probability 1e-6. About 800 numbers are
+with their own spread, failed by a right filter with probability 1e-6. About 400 numbers are
 compared (dependent in time), so of all seeds 1e-3 would fail at most.
 """
 
@@ -25,7 +25,7 @@ from holdfast.problems.problem import ProblemBase
 FALSE_ALARM = 1e-6
 NUM_PARTICLES = 20_000
 RUNS = 32
-STEPS = 25
+STEPS = 12
 
 
 class Linear(ProblemBase):

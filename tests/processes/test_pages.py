@@ -159,6 +159,8 @@ def test_commands_and_programs(page: Page, smaller: dict[str, str], clone: Path)
                 words[index + 1] = smaller.get(word, words[index + 1])
             if smaller and words[1] == "chaos":
                 words[words.index("--trials") + 1] = "1"  # they take seconds each
+            if smaller and words[1] == "check":
+                words += ["--budget", "1"]
             if smaller and words[1] == "run" and "--trials" not in words:
                 words += ["--trials", "1"]  # and not all of the configuration's
             if words[-1] == "&":

@@ -10,7 +10,7 @@ from benchmarks.region_world import Scenario, broken_promises, make_setup, scena
 
 from holdfast.transport import dialer
 
-_SMALL = Scenario(robots=300, processes=3, act_s=0.25, down_s=3.0, after_s=6.0)
+_SMALL = Scenario(robots=120, processes=3, act_s=0.25, down_s=3.0, after_s=6.0)
 _LARGE = Scenario(robots=10_000, processes=10, act_s=1.0, down_s=10.0, after_s=18.0)
 _QUICK = ("silently, all at once", "it is busy for five seconds", "robots in phase")
 
@@ -20,7 +20,7 @@ def _named(base: Scenario) -> list[ParameterSet]:
 
 
 @pytest.mark.parametrize("scenario", [each for each in _named(_SMALL) if each.id in _QUICK])
-def test_300_robots(scenario: Scenario) -> None:
+def test_120_robots(scenario: Scenario) -> None:
     assert broken_promises(scenario, simulate(scenario, make_setup())) == []
 
 
