@@ -46,14 +46,14 @@ def test_a_story_is_told_to_beliefs_of_any_size() -> None:
     for trial, place in enumerate((0.25, 0.5, 0.75)):
         story = history_of(problem, planning(200), 3, trial)
         decisions = sum(isinstance(event, Sensed) for event in story)
-        found = [state_in(problem, planning(n), 3, trial, story) for n in (20_000, 50_000)]
+        found = [state_in(problem, planning(n), 3, trial, story) for n in (5_000, 12_500)]
         assert [state.step for state in found] == [int(place * decisions) * 9] * 2
         # They approximate the same posterior: the means differ by less than the states are spread.
         few, many = (state.belief for state in found)
         means = [belief.weights @ belief.states for belief in (few, many)]
         assert (np.abs(means[0] - means[1]) < spread(many)).all()
         # And know more than at first.
-        first = Planner(problem, planning(50_000)).init(3, trial).belief
+        first = Planner(problem, planning(12_500)).init(3, trial).belief
         assert spread(many)[:2].prod() < 0.5 * spread(first)[:2].prod()
 
 

@@ -182,7 +182,7 @@ def test_the_robot_of_the_page(clone: Path) -> None:
     """The class and its configuration run as they stand there."""
     for name in ("my_robot.py", "my_robot.yaml"):
         (clone / name).write_text(ROBOTS.files[name], encoding="utf-8")
-    done = run(["holdfast", "run", "my_robot.yaml", "--trials", "1"], clone)
+    done = run(["holdfast", "run", "my_robot.yaml", "--trials", "1"], clone, figures=False)
     assert done.returncode == 0, done.stderr
     assert "(1 of 1; " in done.stdout
 

@@ -90,7 +90,7 @@ for count, dimension, kept, posteriors, way in (
     for deviation in (0.4, 3.0):
         log_weights = normals * deviation
         for neighbors in (1, 5, 8, 9, 30):
-            for resolution in (1e-9, 0.2, 20.0):
+            for resolution in (1e-9, 0.2, 20.0) if deviation < 1.0 else (0.2,):
                 result, _, visits, ways = kernel.entropies(
                     points, log_weights, True, 0, neighbors, resolution, 0.0, 0.0, 2, *alone, True)
                 name = f"nearest {count} {dimension} {kept} {deviation} {neighbors} {resolution}"
@@ -228,7 +228,7 @@ class TestInstructionSets:
         assert result["simd"] == simd
         different = [name for name in best_hashes if result["hashes"][name] != best_hashes[name]]
         assert not different
-        assert len(best_hashes) > 500
+        assert len(best_hashes) > 400
 
     def test_an_unknown_one_is_refused_by_name(self) -> None:
         finished = run_workload("mmx")

@@ -413,7 +413,9 @@ def test_the_places_that_findings_name_are_there() -> None:
         assert anchor in {*anchors, ""}, place
 
 
-def test_prices_that_nobody_weighs() -> None:
+def test_prices_that_nobody_weighs(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("streams", "goals", "likelihoods", "trials", "time"):
+        monkeypatch.delitem(CHECKS, name)
     (found,) = [each for each in check(kind_of("Priced")()) if each.check == "prices"]
     assert found.severity == W
     assert "path_entropy does not weigh them: selector.nats_per_cost is 0" in found.seen
