@@ -44,7 +44,7 @@ from studies.published_2017 import PublishedRow, published_rows, series_of
 
 SEED = 2017
 FAMILY_WISE_LEVEL = 0.001
-QUICK_TRIALS = 150
+QUICK_TRIALS = 80
 
 
 def random_rows(problem: str) -> list[PublishedRow]:
