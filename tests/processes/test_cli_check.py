@@ -91,7 +91,7 @@ def test_json_and_the_lines_of_the_user(tmp_path: Path, capsys: pytest.CaptureFi
 @pytest.mark.parametrize(
     ("kind", "move", "code", "seen"),
     [
-        ("Loops", LOOPS, 1, "move raised TimeoutError: it has not returned in 1 s"),
+        ("Loops", LOOPS, 1, "move raised TimeoutError: it has not returned in 0.9 s"),
         ("Ends", ENDS, 1, "move raised ProcessEndError: os._exit(0) would end the process"),
         ("Crashes", CRASHES, 1, "ended the process of the check: it was killed by SIGSEGV in the"),
         ("Slow", SLOW, 0, "0 errors, 0 warnings; too little time for "),
@@ -107,7 +107,7 @@ def test_what_ends_or_hangs_the_process(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(check_process, "PATIENCE_S", 1.0 if kind == "Loops" else 2.0)
+    monkeypatch.setattr(check_process, "PATIENCE_S", 0.9 if kind == "Loops" else 2.0)
     name, budget = written(tmp_path, kind, move), "0.1" if kind == "Slow" else "1000"
     assert main([name, "--problem-directory", str(tmp_path), "-q", "--budget", budget]) == code
     shown = " ".join(capsys.readouterr().out.split())
