@@ -424,18 +424,21 @@ class Service:
 
     def _start_job(self, task: PendingTask, now: float) -> None:
         session, request = task.session, task.request
-        state = task.state
-        if request is not None and request.checkpoint is None:
-            state = session.state_before(request)
-            if state is None and session.knows_trial(request.trial):
-                # The robot is behind what is remembered, or was elsewhere meanwhile.
-                session.remove_task(task)
-                for record in self._calls.detach(task):
-                    self._calls.send_need_state(record.call, record.number, differs=True)
-                return
+        state = task.starts_at()
+        if (
+            state is None
+            and request is not None
+            and request.checkpoint is None
+            and session.knows_trial(request.trial)
+        ):
+            # The robot is behind what is remembered, or was elsewhere meanwhile.
+            session.remove_task(task)
+            for record in self._calls.detach(task):
+                self._calls.send_need_state(record.call, record.number, differs=True)
+            return
         alone = self._queue.is_alone(task)
         estimated_s = self._queue.limits_s[task.lane]
-        task.short_s = task.predicted_s()
+        task.short_s = task.predicted_s(state)
         is_short = task.short_s < math.inf
         problems = self._problems
         problem = (problems.shared if is_short else problems.acquire)(session.problem_key)
