@@ -308,7 +308,7 @@ _defect(
 _defect(
     "observation_not_written",
     "The journal gets the task actions, but not the observations.",
-    Edit(Robot, "_sensed", "self._write(record)", "pass"),
+    Edit(Robot, "_sensed", "self._unwritten.append(record)", "pass"),
 )
 _defect(
     "performance_not_written",
@@ -362,8 +362,9 @@ _defect(
     Edit(
         Robot,
         "_go_on",
-        "if history is None or self._awaits_environment or self._stopped:",
-        "if history is None or (self._awaits_environment and not self._pausing) or self._stopped:",
+        "if history is None or self._awaits_environment or self._is_stopped:",
+        "if history is None or (self._awaits_environment and not self._pausing) "
+        "or self._is_stopped:",
     ),
 )
 

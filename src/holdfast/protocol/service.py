@@ -319,8 +319,10 @@ class Service:
         """Continue a session with the robot's next process; nothing waits for the previous one."""
         self._note("session_taken_over", session, epoch=epoch, previous_epoch=session.epoch)
         self._statistics.sessions_taken_over += 1
-        # The next process numbers its requests anew.
+        # The next process numbers its requests anew, and does not know of an observation with which
+        # the previous one had asked, but which it had not written down when it died.
         session.epoch, session.number = epoch, -1
+        session.acknowledged = None
         self._sessions.use(session, now)
         self._supersede(session, None)
 

@@ -256,7 +256,8 @@ class Session:
         self.company = _digest_of((self.problem_key, configuration.planning))
         self.seed = configuration.seed
         self.served = False  # whether the robot got an answer
-        # acknowledged, ahead: the state last asked about, and that at the next sensing step.
+        # acknowledged, ahead: the state last asked about, and that at the next sensing step. The
+        # first is None if it was asked about by an earlier process of the robot.
         self.acknowledged: PlanningState | None = None
         self.ahead: PlanningState | None = None
         self.ahead_digest = b""
@@ -298,7 +299,7 @@ class Session:
     def state_before(self, request: Request) -> PlanningState | None:
         """Return the nearest state before the request's; None if there is none."""
         asked = request.step, request.sensed
-        for known in (self.ahead, self.acknowledged):
+        for known in self._states():
             if known is None or known.trial != request.trial:
                 continue
             if (known.step, known.sensed) <= asked:
@@ -307,9 +308,11 @@ class Session:
 
     def knows_trial(self, trial: int) -> bool:
         """Return whether a state of the trial is held."""
-        return any(
-            known is not None and known.trial == trial for known in (self.ahead, self.acknowledged)
-        )
+        return any(known is not None and known.trial == trial for known in self._states())
+
+    def _states(self) -> tuple[PlanningState | None, ...]:
+        """Return the states from which it may go on, the later first."""
+        return () if self.acknowledged is None else (self.ahead, self.acknowledged)
 
     def size(self) -> int:
         """Return the bytes of its states and answers."""
