@@ -206,7 +206,7 @@ _defect(
 _defect(
     "held_work_left",
     "A request that waited for the robot's one before is not lined up when that has run.",
-    Edit(Service, "finished", "self._queue.release_held(session)", "pass"),
+    Edit(Service, "next_jobs", "self._queue.release_held(session)", "pass"),
 )
 _defect(
     "forgotten_at_work",

@@ -491,6 +491,8 @@ class Robot:
             history.num_inputs,
             self._source.takes_tasks,
         )
+        if not question.takes_tasks or question.task_count == 0:
+            question.needed_at = now
         self._source.ask(question, now)
         return question
 

@@ -107,6 +107,8 @@ class Service:
         self._sessions = SessionTable(self._limits)
         self._problems = ProblemPool(self._limits.max_problems)
         self._calls = WaitingCalls(self._limits, self._statistics, self._effects)
+        # Of results whose replies are on their way first.
+        self._settling: list[Session] = []
         # Of all robots; each session has its own, which begin here.
         self._task_time = ExpectedTime(1e-3)
         self._sensing_time = ExpectedTime(1e-3)
@@ -193,7 +195,7 @@ class Service:
                     task.expected_time.learn(computed_s, processor_s)
                     self._sessions.alike(session).learn(task.sensing, computed_s, processor_s)
                 self._succeeded(task, outcome, now)
-            self._queue.release_held(session)
+            self._settling.append(session)
         return self._effects.take()
 
     def gone(self, call: int) -> list[ServiceEffect]:
@@ -205,6 +207,11 @@ class Service:
 
     def next_jobs(self, now: float) -> list[ServiceEffect]:
         """Hand out jobs while workers are free; called whenever effects were carried out."""
+        for session in self._settling:
+            if not session.closed:
+                self._limit_memory(session)
+            self._queue.release_held(session)
+        self._settling.clear()
         while (task := self._queue.take(now)) is not None:
             self._start_job(task, now)
         return self._effects.take()
@@ -533,7 +540,6 @@ class Service:
             answer = CachedAnswer(*where, outcome.num_actions, outcome.actions, following)
             session.remember(task.digest, answer, most)
             self._send_task(task, answer, now)
-        self._limit_memory(session)
 
     def _send_task(self, task: PendingTask, answer: CachedAnswer, now: float) -> None:
         """Send the task part, and let the calls wait for the sensing part that follows."""
