@@ -362,9 +362,8 @@ _defect(
     Edit(
         Robot,
         "_go_on",
-        "if history is None or self._awaits_environment or self._is_stopped:",
-        "if history is None or (self._awaits_environment and not self._pausing) "
-        "or self._is_stopped:",
+        "self._awaits_environment or",
+        "(self._awaits_environment and not self._pausing) or",
     ),
 )
 

@@ -138,10 +138,6 @@ class Robot:
         return 0 if self._history is None else self._history.num_unexplained
 
     @property
-    def _is_stopped(self) -> bool:
-        return self._source.stopped_by is not None
-
-    @property
     def _current_history(self) -> Trial:
         assert self._history is not None, "between trials"
         return self._history
@@ -184,7 +180,7 @@ class Robot:
         except HoldfastError as error:
             self._source.stop(error)
             return self._take()
-        if again is not None and not self._is_stopped:
+        if again is not None and self._source.stopped_by is None:
             # It is in the journal already, and the environment says that it was not performed.
             self._awaits_environment = True
             self._write()
@@ -235,7 +231,11 @@ class Robot:
         """Handle an event."""
         if isinstance(event, Sensed | NoReading | Acted | EnvironmentFailed):
             # Between trials, or after a stop, whatever comes late is of no use.
-            if self._history is not None and self._awaits_environment and not self._is_stopped:
+            if (
+                self._history is not None
+                and self._awaits_environment
+                and self._source.stopped_by is None
+            ):
                 self._awaits_environment = False
                 if event.step != self._history.state.step:
                     self._source.stop(
@@ -303,7 +303,7 @@ class Robot:
         state = history.state
         self._judge(step, sensing_action=sensing_action)
         self._hold_if_lost()
-        if not self._pausing and not self._is_stopped:
+        if not self._pausing and self._source.stopped_by is None:
             is_new = history.state is not state  # its belief has begun anew
             self._ask(self._planner.digest(history.state) if is_new else record.digest, now)
 
@@ -363,7 +363,7 @@ class Robot:
         if event.performed is not None:
             # What is written down now needs no environment that counts when the run goes on.
             self._performed(event.performed)
-            if self._is_stopped:
+            if self._source.stopped_by is not None:
                 return
             where += ", whose task action was performed"
         # The account of the failure comes last: it may have many lines.
@@ -390,7 +390,7 @@ class Robot:
         """Do the next thing, if nothing is awaited."""
         self._asleep_until = None
         history = self._history
-        if history is None or self._awaits_environment or self._is_stopped:
+        if history is None or self._awaits_environment or self._source.stopped_by is not None:
             if self._pausing and history is None:
                 self._effects.append(Paused())
             return
@@ -447,7 +447,7 @@ class Robot:
         if question is None or not 0 <= offset < question.task_count:
             question = self._ask(self._planner.digest(state), now)
             offset = 0
-            if self._is_stopped:
+            if self._source.stopped_by is not None:
                 return
         actions = question.task_actions
         if actions is None:
@@ -581,8 +581,7 @@ class Robot:
     def _take(self) -> list[RobotEffect]:
         # Before the robot waits for whatever comes next: it may be killed while it waits.
         self._write()
-        if self._is_stopped and not self._has_halted:
+        if (error := self._source.stopped_by) is not None and not self._has_halted:
             self._has_halted = True
-            assert self._source.stopped_by is not None
-            self._effects.append(Halt(self._source.stopped_by))
+            self._effects.append(Halt(error))
         return self._effects.take()
