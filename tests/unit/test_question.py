@@ -93,9 +93,8 @@ METHODS = [
 
 def test_a_source_stops_once() -> None:
     source = InProcessSource()
-    first = HoldfastError("why")
-    for error in (first, HoldfastError("what follows from it")):
-        source.stop(error)
+    source.stop(first := HoldfastError("why"))
+    source.stop(HoldfastError("what follows from it"))
     assert source.stopped_by is first
 
 
