@@ -23,7 +23,7 @@ from holdfast.config import registry
 from holdfast.config.registry import BUILT_IN
 from holdfast.errors import HoldfastError
 from holdfast.planning.planner import Planner
-from holdfast.protocol.decision_cost import cost_of_answer, cost_of_sensing, describe_cost
+from holdfast.protocol.decision_cost import cost_of_reaching, cost_of_sensing, describe_cost
 from holdfast.protocol.service_sessions import with_cores
 from holdfast.service.calibration import measure_problem, measure_slowness
 
@@ -79,9 +79,8 @@ def main() -> None:
         except HoldfastError as error:
             print(f"failed {error}")
             continue
-        reach = cost_of_answer(
-            problem, settings, own, slowness, steps=steps, inputs=inputs, begins=True, num_bytes=0
-        )
+        reaching = cost_of_reaching(problem, settings, own, slowness)
+        reach = reaching.cost(steps=steps, inputs=inputs, begins=True, num_bytes=0)
         kind: str = method
         if method in ("action_entropy", "path_entropy", "state_entropy"):
             kind += f" {settings.selector.estimator}"

@@ -213,12 +213,12 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     # Works.
     tasks = [task for session in kept for task in works_of(session)]
     lanes = queue._lanes
-    running = [task for lane in lanes for task in lane._running.values()]
+    running = [task for lane in lanes for task in lane.running.values()]
     waiting = [task for task in tasks if not task.running]
     assert statistics.running == len(running) == len(bench.jobs)
     fewer = max(1, bench.workers - 1)
     most = {NEW: fewer, FIRST: fewer, BRIEF: bench.workers, MEDIUM: fewer, LONG: fewer}
-    assert all(lanes[number].num_running <= most[number] for number in most)
+    assert all(len(lanes[number].running) <= most[number] for number in most)
     assert statistics.waiting == len(waiting)
     for lane in lanes:
         check_lane(lane, [task for task in waiting if queue[task.lane] is lane])
@@ -256,7 +256,7 @@ def check_lane(queue: RequestQueue, waiting: list[PendingTask]) -> None:
     assert {id(task) for task in waiting} == {id(task) for task in (*lined_up, *held)}
     assert set(queue._waiting_of) == {task.session.owner for task in waiting}
     for owner in (*queue._waiting_of, "all"):
-        load = queue._waiting if owner == "all" else queue._waiting_of[owner]
+        load = queue.waiting if owner == "all" else queue._waiting_of[owner]
         some = [task for task in waiting if owner in ("all", task.session.owner)]
         assert load.num == len(some)
         assert load.num_bytes == sum(task.size for task in some)

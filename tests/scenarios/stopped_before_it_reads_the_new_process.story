@@ -55,55 +55,62 @@ stop node=cloud-1 at=0.611716 for_s=0.8
    1.0140  robot    restore service=local step=9 bytes=1575
    1.0140  robot    retry service=local step=9 attempt=3 waited_ms=419
    1.0140  robot    asks local, call 3
-   1.0152  robot    hears of call 3: TaskAnswer
-   1.0152  robot    restored service=local step=9 restore_ms=1.2
-   1.0152  robot    resumed held_ms=161.2
-   1.0152  robot    performs task actions 9 to 10
-   1.0452  robot    hears of call 3: SensingAnswer
-   1.0452  robot    hears of call 3: its end
-   1.0556  robot    performs task actions 11 to 17
-   1.1970  robot    performs sensing action 0 of step 18
-   1.1980  robot    asks local, call 4
-   1.1982  robot    hears of call 4: NeedState
-   1.1982  robot    restore service=local step=18 bytes=1575
-   1.1982  robot    asks local, call 5
-   1.1994  robot    hears of call 5: TaskAnswer
-   1.1994  robot    restored service=local step=18 restore_ms=1.2
-   1.1994  robot    performs task actions 18 to 19
-   1.2294  robot    hears of call 5: SensingAnswer
-   1.2294  robot    hears of call 5: its end
-   1.2398  robot    performs task actions 20 to 26
-   1.3812  robot    performs sensing action 0 of step 27
-   1.3822  robot    asks local, call 6
-   1.3824  robot    hears of call 6: NeedState
-   1.3824  robot    restore service=local step=27 bytes=1575
-   1.3824  robot    asks local, call 7
-   1.3836  robot    hears of call 7: TaskAnswer
-   1.3836  robot    restored service=local step=27 restore_ms=1.2
-   1.3836  robot    performs task actions 27 to 28
+   1.0442  robot    hears of call 3: SensingAnswer
+   1.0442  robot    restored service=local step=9 restore_ms=30.2
+   1.0442  robot    resumed held_ms=190.2
+   1.0442  robot    performs sensing action 0 of step 9
+   1.0442  robot    hears of call 3: its end
+   1.0452  robot    asks local, call 4
+   1.0464  robot    hears of call 4: TaskAnswer
+   1.0464  robot    performs task actions 9 to 10
+   1.0764  robot    hears of call 4: SensingAnswer
+   1.0764  robot    hears of call 4: its end
+   1.0868  robot    performs task actions 11 to 17
+   1.2282  robot    performs sensing action 0 of step 18
+   1.2292  robot    asks local, call 5
+   1.2294  robot    hears of call 5: NeedState
+   1.2294  robot    restore service=local step=18 bytes=1575
+   1.2294  robot    asks local, call 6
+   1.2306  robot    hears of call 6: TaskAnswer
+   1.2306  robot    restored service=local step=18 restore_ms=1.2
+   1.2306  robot    performs task actions 18 to 19
+   1.2606  robot    hears of call 6: SensingAnswer
+   1.2606  robot    hears of call 6: its end
+   1.2710  robot    performs task actions 20 to 26
    1.4117  cloud-1  goes on
-   1.4136  robot    hears of call 7: SensingAnswer
-   1.4136  robot    hears of call 7: its end
+   1.4124  robot    performs sensing action 0 of step 27
+   1.4134  robot    asks local, call 7
+   1.4136  robot    hears of call 7: NeedState
+   1.4136  robot    restore service=local step=27 bytes=1575
+   1.4136  robot    asks local, call 8
+   1.4148  robot    hears of call 8: TaskAnswer
+   1.4148  robot    restored service=local step=27 restore_ms=1.2
+   1.4148  robot    performs task action 27
    1.4217  robot    service_appeared service=cloud-1
    1.4217  robot    restore service=cloud-1 step=27 bytes=1575
-   1.4217  robot    asks cloud-1, call 8
-   1.4240  robot    performs task actions 29 to 34
-   1.5427  robot    hears of call 8: TaskAnswer
+   1.4217  robot    asks cloud-1, call 9
+   1.4350  robot    performs task action 28
+   1.4448  robot    hears of call 8: SensingAnswer
+   1.4448  robot    hears of call 8: its end
+   1.4552  robot    performs task actions 29 to 33
+   1.5427  robot    hears of call 9: TaskAnswer
    1.5427  robot    restored service=cloud-1 step=27 restore_ms=121
    1.5427  robot    status from=local_recovery to=keep_alive outage_ms=688.723 reason=cloud-1 has answered
-   1.5452  robot    performs task action 35
-   1.5654  robot    performs sensing action 2 of step 36
-   1.5664  robot    unexplained trial=0 step=36 sensing_action=2 deviations=41.5642 reason=more than 8 standard deviations from every particle
-   1.5664  robot    asks cloud-1, call 9
-   1.6464  robot    hears of call 9: NeedState
-   1.6464  robot    restore service=cloud-1 step=36 bytes=1575
-   1.6464  robot    asks cloud-1, call 10
-   1.7274  robot    hears of call 10: TaskAnswer
-   1.7274  robot    restored service=cloud-1 step=36 restore_ms=81
-   1.7274  robot    performs task actions 36 to 37
-   1.7574  robot    hears of call 10: SensingAnswer
-   1.7574  robot    hears of call 10: its end
-   1.7678  robot    performs task actions 38 to 39
-   1.8082  robot    ends trial 0 after 40 steps
+   1.5562  robot    performs task action 34
+   1.5727  robot    hears of call 9: SensingAnswer
+   1.5727  robot    hears of call 9: its end
+   1.5764  robot    performs task action 35
+   1.5966  robot    performs sensing action 2 of step 36
+   1.5976  robot    asks cloud-1, call 10
+   1.6776  robot    hears of call 10: NeedState
+   1.6776  robot    restore service=cloud-1 step=36 bytes=1575
+   1.6776  robot    asks cloud-1, call 11
+   1.7586  robot    hears of call 11: TaskAnswer
+   1.7586  robot    restored service=cloud-1 step=36 restore_ms=81
+   1.7586  robot    performs task actions 36 to 37
+   1.7886  robot    hears of call 11: SensingAnswer
+   1.7886  robot    hears of call 11: its end
+   1.7990  robot    performs task actions 38 to 39
+   1.8394  robot    ends trial 0 after 40 steps
 
 decided as without faults

@@ -206,7 +206,7 @@ _defect(
 _defect(
     "held_work_left",
     "A request that waited for the robot's one before is not lined up when that has run.",
-    Edit(Service, "finished", "self._queue.release_held(session)", "pass"),
+    Edit(Service, "next_jobs", "self._queue.release_held(session)", "pass"),
 )
 _defect(
     "forgotten_at_work",
@@ -308,7 +308,7 @@ _defect(
 _defect(
     "observation_not_written",
     "The journal gets the task actions, but not the observations.",
-    Edit(Robot, "_sensed", "self._write(record)", "pass"),
+    Edit(Robot, "_sensed", "self._unwritten.append(record)", "pass"),
 )
 _defect(
     "performance_not_written",
@@ -362,8 +362,8 @@ _defect(
     Edit(
         Robot,
         "_go_on",
-        "if history is None or self._awaits_environment or self._stopped:",
-        "if history is None or (self._awaits_environment and not self._pausing) or self._stopped:",
+        "self._awaits_environment or",
+        "(self._awaits_environment and not self._pausing) or",
     ),
 )
 

@@ -16,7 +16,7 @@ from holdfast.protocol.decision_cost import (
     TYPICAL_PROBLEM,
     CallCost,
     Cost,
-    cost_of_answer,
+    cost_of_reaching,
     cost_of_sensing,
     describe_cost,
 )
@@ -28,7 +28,7 @@ PEG = registry.problem_class("peg_in_hole_2d").from_settings({}, {})
 
 def answer(settings: PlanningSettings, **changes: Any) -> Cost:
     asked: dict[str, Any] = {"steps": 9.0, "inputs": 1.0, "begins": True, "num_bytes": 100.0}
-    return cost_of_answer(PEG, settings, **{**asked, **changes})
+    return cost_of_reaching(PEG, settings).cost(**{**asked, **changes})
 
 
 def is_least(less: Cost, more: Cost) -> bool:
@@ -111,9 +111,8 @@ def test_the_defaults_are_brief() -> None:
     for name in ("peg_in_hole_2d", "multitier_peg_in_hole_2d", "capsule_robot", "peg_in_hole_3d"):
         problem = registry.problem_class(name).from_settings({}, {})
         assert cost_of_sensing(problem, PlanningSettings()).seconds < limits.max_brief_s
-        failed_over = cost_of_answer(
-            problem, PlanningSettings(), steps=100, inputs=11, begins=True, num_bytes=500
-        )
+        reaching = cost_of_reaching(problem, PlanningSettings())
+        failed_over = reaching.cost(steps=100, inputs=11, begins=True, num_bytes=500)
         assert failed_over.seconds < limits.max_medium_s
 
 
@@ -199,5 +198,5 @@ def test_the_model_in_numbers(
     own = getattr(problem, "own", TYPICAL_PROBLEM)
     sensing = cost_of_sensing(problem(), settings, own, 1.5)
     asked: dict[str, Any] = {"steps": 9.0, "inputs": 2.0, "begins": True, "num_bytes": 100.0}
-    reached = cost_of_answer(problem(), settings, own, 1.5, **asked)
+    reached = cost_of_reaching(problem(), settings, own, 1.5).cost(**asked)
     assert (*sensing, *reached) == pytest.approx(expected, rel=1e-9)

@@ -13,7 +13,6 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.messages import MAX_TASK_ACTIONS, SensingAnswer, TaskAnswer
 from holdfast.protocol.question import DecisionSource, InProcessSource, Question, same_actions
-from holdfast.protocol.robot_events import Halt
 
 
 def question(step: int = 0, *, sensed: bool = False, interval: int = 2) -> Question:
@@ -94,10 +93,9 @@ METHODS = [
 
 def test_a_source_stops_once() -> None:
     source = InProcessSource()
-    for _ in range(2):
-        source.stop(HoldfastError("why"))
-    (halt,) = source.effects
-    assert isinstance(halt, Halt)
+    source.stop(first := HoldfastError("why"))
+    source.stop(HoldfastError("what follows from it"))
+    assert source.stopped_by is first
 
 
 @pytest.mark.parametrize("source", [Dispatcher, InProcessSource])

@@ -102,10 +102,10 @@ class TestRequestQueue:
             self.task(self.session(key), b"%d" % key, 0.0, prefetched=False)
         _, job = self.run_one()
         assert self.queue.take(self.now) is None
-        assert self.queue.num_waiting == 2
+        assert self.queue.waiting.num == 2
         self.finish(job)
         assert self.run_one()[0] == b"1"
-        assert self.queue.num_waiting == 1
+        assert self.queue.waiting.num == 1
 
     def test_prefetches_that_waited_together_run_together(self) -> None:
         """Found by the simulator (seed 27053): the second end found the slot free already."""
@@ -116,7 +116,7 @@ class TestRequestQueue:
         (_, first), (_, second) = self.run_one(), self.run_one()
         self.finish(first)
         self.finish(second)
-        assert (self.queue.num_running, self.queue.num_waiting) == (0, 0)
+        assert (len(self.queue.running), self.queue.waiting.num) == (0, 0)
 
 
 def made(
@@ -269,7 +269,7 @@ class TestTheWait:
         assert self.wait_s(9.0) == 0.0  # longer than was expected
         assert self.queue.end(job) is task
         assert [*running, task.running] == [True, False]
-        assert (self.queue.num_running, self.wait_s(1.5)) == (0, 0.0)
+        assert (len(self.queue.running), self.wait_s(1.5)) == (0, 0.0)
 
     def wait_s(self, now: float) -> float:
         return self.queue.wait_s(now, None)
@@ -286,10 +286,10 @@ class TestTheWait:
         assert not self.overloaded()
         assert self.wait_s(0.0) == pytest.approx(0.15)
         self.queue.remove(first)
-        assert self.queue.num_waiting == 1
+        assert self.queue.waiting.num == 1
         assert self.wait_s(0.0) == pytest.approx(0.1)
         self.queue.remove(second)
-        assert (self.queue.num_waiting, self.wait_s(0.0)) == (0, 0.0)
+        assert (self.queue.waiting.num, self.wait_s(0.0)) == (0, 0.0)
         assert self.queue._waiting_of == {}
         assert self.queue.take(1.0) is None
 

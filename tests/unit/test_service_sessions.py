@@ -429,7 +429,7 @@ def test_which_tasks_earlier_times_predict() -> None:
             session, b"", sensing=sensing, request=request, state=None, size=0, since=0.0
         )
         session.acknowledged = None if state is None else robot.state._replace(step=state)
-        return task.predicted_s() < math.inf
+        return task.predicted_s(task.starts_at()) < math.inf
 
     request = msgspec.structs.replace(request, inputs=one)
     assert typical(request)

@@ -3,9 +3,9 @@
 A trial is (seed, number) and a list of inputs: what was sensed, what moves have shown, what came
 late, a belief that was begun anew. An input is a record of the journal, and what is sent to a
 service that lacks it; what replays a trial reads them, and what shows one. The records of a trial
-are in the journal before they are used: an observation before it is folded in, a task action before
-it is performed. So after a crash the journal holds all that was done and seen. It cannot tell one
-thing, whether the last task action was still performed; only the environment can.
+are in the journal before they are used: an observation before an answer to it is, a task action
+before it is performed. So after a crash the journal holds all that was done and used. It cannot
+tell one thing, whether the last task action was still performed; only the environment can.
 """
 
 from __future__ import annotations

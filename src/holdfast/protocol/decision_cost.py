@@ -104,11 +104,28 @@ class Cost(NamedTuple):
     num_bytes: float
 
 
+class Reaching(NamedTuple):
+    """What it takes at most to reach a state."""
+
+    least: Cost  # of what each one takes
+    begin_s: float  # for the initial belief
+    step_s: float  # for each step by which it is rolled forward, those of the task part included
+    fold_s: float  # for each observation
+    byte_s: float  # for each byte of the request
+
+    def cost(self, *, steps: float, inputs: float, begins: bool, num_bytes: float) -> Cost:
+        """Return the cost of one state; ``begins`` if it is reached from the initial belief."""
+        seconds = self.least.seconds + (self.begin_s if begins else 0.0) + steps * self.step_s
+        seconds += inputs * self.fold_s + num_bytes * self.byte_s
+        return Cost(seconds, self.least.num_bytes + 3.0 * num_bytes)
+
+
 class Price(NamedTuple):
-    """What is the same for all decisions of a session: what its problem and its sensing cost."""
+    """What is the same for all decisions of a session."""
 
     problem: ProblemCost
     sensing: Cost
+    reaching: Reaching
 
 
 class Pricing(NamedTuple):
@@ -123,7 +140,8 @@ class Pricing(NamedTuple):
     ) -> Price:
         """Return what decisions cost; ``known`` is what the problem does, if it was measured."""
         own = known or (TYPICAL_PROBLEM if self.measure is None else self.measure(problem))
-        return Price(own, cost_of_sensing(problem, planning, own, self.slowness))
+        sensing = cost_of_sensing(problem, planning, own, self.slowness)
+        return Price(own, sensing, cost_of_reaching(problem, planning, own, self.slowness))
 
 
 ANY_MACHINE = Pricing()
@@ -378,31 +396,30 @@ def _expected_return(sizes: _Sizes) -> Cost:
     return Cost(seconds, num_bytes)
 
 
-def cost_of_answer(
+def cost_of_reaching(
     problem: Problem,
     planning: PlanningSettings,
     own: ProblemCost = TYPICAL_PROBLEM,
     slowness: float = 1.0,
-    *,
-    steps: float,  # by which it is rolled forward, those of the task part included
-    inputs: float,  # observations to be folded in
-    begins: bool,  # whether it begins with the initial belief
-    num_bytes: float,  # size of the request
-) -> Cost:
-    """Return the most that it takes to reach a state."""
+) -> Reaching:
+    """Return what it takes to reach the states of a session."""
     sizes = _Sizes(problem, planning, own, slowness)
     particles, size = sizes.particles, float(own.observation_size)
-    seconds = (2.0 * _PYTHON + 2.0 * sizes.state_bytes + 4.0 * num_bytes) * sizes.unit_s
-    if begins:
-        seconds += own.initial.of(particles)
-    seconds += steps * sizes.step_s()
     # Likelihood, gate and resampling.
     number = 30.0 + 10.0 * size + 6.0 * size * size + 6.0 * sizes.coordinates
     fold_s = (2.0 * _PYTHON + particles * number) * sizes.unit_s + own.sense.of(particles)
     if sizes.general and getattr(problem, "rank_test", False):
         fold_s += 19.0 * (own.sense.of(particles) + 20.0 * particles * sizes.unit_s)
-    seconds += inputs * (fold_s + own.stage.of(1.0))
-    return Cost(seconds, 8.0 * sizes.state_bytes + 3.0 * num_bytes + 24.0 * size * particles)
+    return Reaching(
+        Cost(
+            (2.0 * _PYTHON + 2.0 * sizes.state_bytes) * sizes.unit_s,
+            8.0 * sizes.state_bytes + 24.0 * size * particles,
+        ),
+        own.initial.of(particles),
+        sizes.step_s(),
+        fold_s + own.stage.of(1.0),
+        4.0 * sizes.unit_s,
+    )
 
 
 def describe_cost(problem: Problem | None, planning: PlanningSettings) -> str:

@@ -121,7 +121,7 @@ class Dispatcher(DecisionSource):
             if call.answered:
                 self._calls.abandon(call)
         self.wake(now)
-        if not self.stopped:
+        if self.stopped_by is None:
             self._try_others(question, now)
 
     def drop(self) -> None:
@@ -167,7 +167,7 @@ class Dispatcher(DecisionSource):
 
     def next_wakeup(self) -> float | None:
         """Return when :meth:`wake` is due if nothing happens before; None if never."""
-        if self.stopped:
+        if self.stopped_by is not None:
             return None
         services, question = self._services, self.question
         due: list[float | None] = []
@@ -319,7 +319,7 @@ class Dispatcher(DecisionSource):
 
     def wake(self, now: float) -> None:
         """Do what is due now; every event is followed by it."""
-        if self.stopped:
+        if self.stopped_by is not None:
             return
         self._woke_at = now
         self._suspect_silent(now)

@@ -29,7 +29,6 @@ from holdfast.protocol.messages import (
 )
 from holdfast.protocol.robot_events import (
     ComputeOwnAnswer,
-    Halt,
     OwnAnswer,
     RecoveryExited,
     RobotEffect,
@@ -235,7 +234,7 @@ class DecisionSource:
         # Since when the robot holds still because no service is usable.
         self.holding_since: float | None = None
         self.takes_tasks = False  # whether the robot takes task actions itself
-        self.stopped = False  # whether this source has stopped the run
+        self.stopped_by: HoldfastError | None = None  # why the robot holds still for good
 
     @property
     def num_unverified(self) -> int:
@@ -271,10 +270,8 @@ class DecisionSource:
         """Note that for so long the robot's process could not receive."""
 
     def stop(self, error: HoldfastError) -> None:
-        """Hold still for good."""
-        if not self.stopped:
-            self.stopped = True
-            self.effects.append(Halt(error))
+        """Hold still for good; the robot orders it when all is written."""
+        self.stopped_by = self.stopped_by or error
 
 
 class InProcessSource(DecisionSource):

@@ -101,24 +101,14 @@ class RequestQueue:
         self._max_waiting_bytes = room * limits.max_waiting_bytes
         self._urgent, self._later = _RoundRobin(), _RoundRobin()
         self._patience_s = 1e-3 * limits.prefetch_patience_ms
-        self._running: dict[Job, PendingTask] = {}
+        self.running: dict[Job, PendingTask] = {}  # tasks that workers have
         # A task that comes while one of its session and slot runs is held back, so that a robot has
         # no more than its turn. Only prefetches that waited together may run together.
         self._running_of: dict[tuple[Session, int], PendingTask] = {}
         self._held: dict[tuple[Session, int], PendingTask] = {}
-        self._waiting = _Load()
+        self.waiting = _Load()  # tasks not yet begun
         # Only of owners with waiting tasks.
         self._waiting_of: dict[Owner, _Load] = {}
-
-    @property
-    def num_waiting(self) -> int:
-        """Tasks not yet begun."""
-        return self._waiting.num
-
-    @property
-    def num_running(self) -> int:
-        """Tasks that workers have."""
-        return len(self._running)
 
     # -- waiting ---------------------------------------------------------------------------------
 
@@ -159,7 +149,7 @@ class RequestQueue:
     def _count(self, task: PendingTask, sign: int) -> None:
         owner = task.session.owner
         load = self._waiting_of.setdefault(owner, _Load())
-        for each in (self._waiting, load):
+        for each in (self.waiting, load):
             each.count(task, sign)
         if not load.num:
             del self._waiting_of[owner]
@@ -171,7 +161,7 @@ class RequestQueue:
 
         None, too, if it takes more than ``room_bytes`` of memory; it keeps its turn.
         """
-        task = self._next() if self._waiting.num else None
+        task = self._next() if self.waiting.num else None
         if task is None or task.num_bytes > room_bytes or not self._is_free_for(task):
             return None
         order = self._order_of(task)
@@ -182,12 +172,12 @@ class RequestQueue:
 
     def _is_free_for(self, task: PendingTask) -> bool:
         """Return whether a worker is free, or takes a short task together with other short ones."""
-        if len(self._running) < self._workers:
+        if len(self.running) < self._workers:
             return True
-        if len(self._running) >= _MOST_TOGETHER:
+        if len(self.running) >= _MOST_TOGETHER:
             return False
-        running_s = sum(each.short_s for each in self._running.values())
-        return running_s + task.predicted_s() <= _TOGETHER_S
+        running_s = sum(each.short_s for each in self.running.values())
+        return running_s + task.predicted_s(task.starts_at()) <= _TOGETHER_S
 
     def _next(self) -> PendingTask | None:
         urgent, later = self._urgent.first(), self._later.first()
@@ -211,32 +201,24 @@ class RequestQueue:
         task.running = True
         task.started_at = now
         self._running_of[task.session, task.slot] = task
-        self._running[job] = task
+        self.running[job] = task
 
     @property
     def running_bytes(self) -> float:
         """Estimated memory of all running tasks."""
-        return sum(task.num_bytes for task in self._running.values())
-
-    def running(self) -> list[tuple[Job, PendingTask]]:
-        """Return the jobs that workers have, and their tasks."""
-        return list(self._running.items())
-
-    def runs(self, job: Job) -> bool:
-        """Return whether a worker has a job of this queue."""
-        return job in self._running
+        return sum(task.num_bytes for task in self.running.values())
 
     def job_of(self, task: PendingTask) -> Job:
         """Return the job of a running task."""
-        return next(job for job, other in self._running.items() if other is task)
+        return next(job for job, other in self.running.items() if other is task)
 
     def started(self, job: Job, now: float) -> None:
         """Note that a worker starts its task only now."""
-        self._running[job].started_at = now
+        self.running[job].started_at = now
 
     def end(self, job: Job) -> PendingTask:
         """Note that a worker is free; return its task."""
-        task = self._running.pop(job)
+        task = self.running.pop(job)
         task.running = False
         # Two prefetches that waited together run together; the first end frees the slot.
         self._running_of.pop((task.session, task.slot), None)
@@ -253,12 +235,14 @@ class RequestQueue:
 
     def is_overloaded(self, now: float, owner: Owner) -> bool:
         """Return whether a new request is to be turned away."""
+        if self.waiting.num < self._workers:
+            return False
         ahead, ahead_s = self._ahead(now, owner)
         if ahead < self._workers:
             return False
         return (
-            self._waiting.num >= self._max_waiting
-            or self._waiting.num_bytes >= self._max_waiting_bytes
+            self.waiting.num >= self._max_waiting
+            or self.waiting.num_bytes >= self._max_waiting_bytes
             or self._has_its_share(owner)
             or 1e3 * ahead_s > self._limits.max_wait_ms * self._workers
         )
@@ -283,9 +267,9 @@ class RequestQueue:
         These are those that run, the owner's own, and of each other owner as many, and one more.
         """
         running_s = sum(
-            max(0.0, task.cost_s - (now - task.started_at)) for task in self._running.values()
+            max(0.0, task.cost_s - (now - task.started_at)) for task in self.running.values()
         )
-        whole, own = self._waiting, self._waiting_of.get(owner)
+        whole, own = self.waiting, self._waiting_of.get(owner)
         if own is not None and len(self._waiting_of) == 1:
             return whole.num, running_s + whole.cost_s
         turns = 1 + (0 if own is None else own.num)

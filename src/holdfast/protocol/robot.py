@@ -3,7 +3,8 @@
 The robot holds the true state: its belief, folded from what it sensed and did. Services only
 compute what follows from it. Each turn takes the next decision from the current answer, orders it
 from the environment and folds in the result. A task action is in the journal before it is ordered,
-an observation before it is used. When the answer is used up, the robot asks a new question.
+an observation before what follows from it is used; only a question leaves sooner, since a service
+that knows more than the journal does no harm. When the answer is used up, the robot asks a new one.
 
 While the robot performs the task actions of an answer, the next sensing action is already being
 computed. It is used only if the state in which it was chosen is, bit for bit, the one in which the
@@ -93,7 +94,7 @@ class Robot:
         self._timed_provenance: Provenance | None = None
         self._unwritten: list[Record] = []
         # has_decided: whether this process has used an answer.
-        self._pausing = self._stopped = self.has_decided = False
+        self._pausing = self._has_halted = self.has_decided = False
         self._next_tick: float | None = None
         self._asleep_until: float | None = None
         self._report_ticks_at = 0.0
@@ -177,9 +178,9 @@ class Robot:
                 self._take_late_observation(late)
             self._hold_if_lost()
         except HoldfastError as error:
-            self._stop(error)
+            self._source.stop(error)
             return self._take()
-        if again is not None and not self._stopped:
+        if again is not None and self._source.stopped_by is None:
             # It is in the journal already, and the environment says that it was not performed.
             self._awaits_environment = True
             self._write()
@@ -230,10 +231,14 @@ class Robot:
         """Handle an event."""
         if isinstance(event, Sensed | NoReading | Acted | EnvironmentFailed):
             # Between trials, or after a stop, whatever comes late is of no use.
-            if self._history is not None and self._awaits_environment and not self._stopped:
+            if (
+                self._history is not None
+                and self._awaits_environment
+                and self._source.stopped_by is None
+            ):
                 self._awaits_environment = False
                 if event.step != self._history.state.step:
-                    self._stop(
+                    self._source.stop(
                         HeldError(
                             f"the environment answered for step {event.step} where step "
                             f"{self._history.state.step} was asked of it; the robot holds still"
@@ -290,15 +295,15 @@ class Robot:
         try:
             record = history.take(given)
         except HoldfastError as error:
-            self._stop(error)
+            self._source.stop(error)
             return
-        self._write(record)
+        self._unwritten.append(record)
         if isinstance(event, NoReading):
             self.reports.no_reading(history, sensing_action=sensing_action)
         state = history.state
         self._judge(step, sensing_action=sensing_action)
         self._hold_if_lost()
-        if not self._pausing and not self._stopped:
+        if not self._pausing and self._source.stopped_by is None:
             is_new = history.state is not state  # its belief has begun anew
             self._ask(self._planner.digest(history.state) if is_new else record.digest, now)
 
@@ -314,11 +319,12 @@ class Robot:
     def _hold_if_lost(self) -> None:
         """Hold still if that is to be done: after all that has come at once is written down."""
         if self._lost_at is not None:
-            self._stop(held_error(self._current_history, self._lost_at))
+            self._source.stop(held_error(self._current_history, self._lost_at))
 
     def _reinitialise(self) -> None:
         """Begin the belief anew, before anything else is decided."""
         history = self._current_history
+        self._write()  # by itself: what it rests on is known even if this fails
         self._write(history.take(Reinitialised(history.state.step)))
         self.reports.reinitialised(history)
 
@@ -332,7 +338,7 @@ class Robot:
                 self.reports.no_reading(self._current_history, taken=step)
             self._hold_if_lost()
         except HoldfastError as error:
-            self._stop(error)
+            self._source.stop(error)
 
     def _fold_move(self, moved: Moved) -> None:
         """Fold in what a performed task action has shown."""
@@ -357,20 +363,20 @@ class Robot:
         if event.performed is not None:
             # What is written down now needs no environment that counts when the run goes on.
             self._performed(event.performed)
-            if self._stopped:
+            if self._source.stopped_by is not None:
                 return
             where += ", whose task action was performed"
         # The account of the failure comes last: it may have many lines.
         if not event.action_in_doubt:
-            self._stop(HeldError(f"{where}: {event.text}"))
+            self._source.stop(HeldError(f"{where}: {event.text}"))
         elif event.counts_steps:
-            self._stop(
+            self._source.stop(
                 HeldError(
                     f"{where}, and whether its task action was performed is not known: {event.text}"
                 )
             )
         else:
-            self._stop(
+            self._source.stop(
                 UnknownPerformanceError(
                     f"{where}, and nobody can say whether its task action was performed, because "
                     "the environment has no method steps_performed; this trial cannot be gone on "
@@ -384,8 +390,7 @@ class Robot:
         """Do the next thing, if nothing is awaited."""
         self._asleep_until = None
         history = self._history
-        self._stopped = self._stopped or self._source.stopped
-        if history is None or self._awaits_environment or self._stopped:
+        if history is None or self._awaits_environment or self._source.stopped_by is not None:
             if self._pausing and history is None:
                 self._effects.append(Paused())
             return
@@ -442,6 +447,8 @@ class Robot:
         if question is None or not 0 <= offset < question.task_count:
             question = self._ask(self._planner.digest(state), now)
             offset = 0
+            if self._source.stopped_by is not None:
+                return
         actions = question.task_actions
         if actions is None:
             self._await_answer(now)
@@ -450,7 +457,7 @@ class Robot:
             try:
                 actions.append(self._planner.choose_task_action(state)[0])
             except HoldfastError as error:
-                self._stop(error)
+                self._source.stop(error)
                 return
         provenance = question.task_provenance
         if offset == 0 and provenance is not None and provenance is not self._timed_provenance:
@@ -476,7 +483,6 @@ class Robot:
 
     def _ask(self, state_digest: bytes, now: float) -> Question:
         history = self._current_history
-        self._write()
         question = Question(
             self._planner,
             history.state,
@@ -485,6 +491,8 @@ class Robot:
             history.num_inputs,
             self._source.takes_tasks,
         )
+        if not question.takes_tasks or question.task_count == 0:
+            question.needed_at = now
         self._source.ask(question, now)
         return question
 
@@ -492,8 +500,6 @@ class Robot:
         """Wait for the rest of the answer."""
         question = self._source.question
         if question is not None and question.needed_at is None:
-            # The source may stop the run: what happened before that is written before it.
-            self._write()
             question.needed_at = now
             self._source.wake(now)
 
@@ -572,12 +578,10 @@ class Robot:
             )
         )
 
-    def _stop(self, error: HoldfastError) -> None:
-        self._stopped = True
-        self._write()
-        self._effects.append(Halt(error))
-
     def _take(self) -> list[RobotEffect]:
         # Before the robot waits for whatever comes next: it may be killed while it waits.
         self._write()
+        if (error := self._source.stopped_by) is not None and not self._has_halted:
+            self._has_halted = True
+            self._effects.append(Halt(error))
         return self._effects.take()

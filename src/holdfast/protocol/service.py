@@ -107,6 +107,8 @@ class Service:
         self._sessions = SessionTable(self._limits)
         self._problems = ProblemPool(self._limits.max_problems)
         self._calls = WaitingCalls(self._limits, self._statistics, self._effects)
+        # Of results whose replies are on their way first.
+        self._settling: list[Session] = []
         # Of all robots; each session has its own, which begin here.
         self._task_time = ExpectedTime(1e-3)
         self._sensing_time = ExpectedTime(1e-3)
@@ -193,7 +195,7 @@ class Service:
                     task.expected_time.learn(computed_s, processor_s)
                     self._sessions.alike(session).learn(task.sensing, computed_s, processor_s)
                 self._succeeded(task, outcome, now)
-            self._queue.release_held(session)
+            self._settling.append(session)
         return self._effects.take()
 
     def gone(self, call: int) -> list[ServiceEffect]:
@@ -205,6 +207,11 @@ class Service:
 
     def next_jobs(self, now: float) -> list[ServiceEffect]:
         """Hand out jobs while workers are free; called whenever effects were carried out."""
+        for session in self._settling:
+            if not session.closed:
+                self._limit_memory(session)
+            self._queue.release_held(session)
+        self._settling.clear()
         while (task := self._queue.take(now)) is not None:
             self._start_job(task, now)
         return self._effects.take()
@@ -319,8 +326,10 @@ class Service:
         """Continue a session with the robot's next process; nothing waits for the previous one."""
         self._note("session_taken_over", session, epoch=epoch, previous_epoch=session.epoch)
         self._statistics.sessions_taken_over += 1
-        # The next process numbers its requests anew.
+        # The next process numbers its requests anew, and does not know of an observation with which
+        # the previous one had asked, but which it had not written down when it died.
         session.epoch, session.number = epoch, -1
+        session.acknowledged = None
         self._sessions.use(session, now)
         self._supersede(session, None)
 
@@ -424,18 +433,21 @@ class Service:
 
     def _start_job(self, task: PendingTask, now: float) -> None:
         session, request = task.session, task.request
-        state = task.state
-        if request is not None and request.checkpoint is None:
-            state = session.state_before(request)
-            if state is None and session.knows_trial(request.trial):
-                # The robot is behind what is remembered, or was elsewhere meanwhile.
-                session.remove_task(task)
-                for record in self._calls.detach(task):
-                    self._calls.send_need_state(record.call, record.number, differs=True)
-                return
+        state = task.starts_at()
+        if (
+            state is None
+            and request is not None
+            and request.checkpoint is None
+            and session.knows_trial(request.trial)
+        ):
+            # The robot is behind what is remembered, or was elsewhere meanwhile.
+            session.remove_task(task)
+            for record in self._calls.detach(task):
+                self._calls.send_need_state(record.call, record.number, differs=True)
+            return
         alone = self._queue.is_alone(task)
         estimated_s = self._queue.limits_s[task.lane]
-        task.short_s = task.predicted_s()
+        task.short_s = task.predicted_s(state)
         is_short = task.short_s < math.inf
         problems = self._problems
         problem = (problems.shared if is_short else problems.acquire)(session.problem_key)
@@ -528,7 +540,6 @@ class Service:
             answer = CachedAnswer(*where, outcome.num_actions, outcome.actions, following)
             session.remember(task.digest, answer, most)
             self._send_task(task, answer, now)
-        self._limit_memory(session)
 
     def _send_task(self, task: PendingTask, answer: CachedAnswer, now: float) -> None:
         """Send the task part, and let the calls wait for the sensing part that follows."""

@@ -37,7 +37,6 @@ from holdfast.protocol.decision_cost import (
     Price,
     Pricing,
     ProblemCost,
-    cost_of_answer,
     describe_cost,
 )
 from holdfast.protocol.effects import LogEvent
@@ -228,8 +227,8 @@ class Job:
                 f"action_size of {problem.name} is {problem.action_size}: a service takes at most "
                 f"{MAX_ACTION_SIZE}"
             )
-        request, planning = self.request, self.planning
-        reached = Cost(0.0, 0.0)
+        request, limits = self.request, self._limits
+        reached, sensing = Cost(0.0, 0.0), price.sensing
         if request is not None:
             steps, state = 0, self.state
             size = sum(len(each.observation) for each in request.inputs)
@@ -237,44 +236,33 @@ class Job:
                 size += len(request.checkpoint)
             else:
                 steps = min(
-                    max(0, request.step - (0 if state is None else state.step)),
-                    self._limits.max_steps,
+                    max(0, request.step - (0 if state is None else state.step)), limits.max_steps
                 )
             if self.kind == "task":
-                steps += min(planning.sensing_interval, MAX_TASK_ACTIONS) + 1
-            reached = cost_of_answer(
-                problem,
-                planning,
-                price.problem,
-                self._pricing.slowness,
+                steps += min(self.planning.sensing_interval, MAX_TASK_ACTIONS) + 1
+            reached = price.reaching.cost(
                 steps=steps,
                 inputs=len(request.inputs),
                 begins=state is None and request.checkpoint is None,
                 num_bytes=size,
             )
-        longest = Cost(
-            max(reached.seconds, price.sensing.seconds),
-            max(reached.num_bytes, price.sensing.num_bytes),
-        )
-        limits = self._limits
-        for estimated, limit, unit, what, option in (
-            (longest.seconds, limits.max_decision_s, "s", "on one core", "--max-decision-s"),
-            (
-                longest.num_bytes / 2**20,
-                limits.max_decision_bytes / 2**20,
-                "MB",
-                "of memory",
-                "--max-decision-mb",
-            ),
-        ):
-            if estimated > limit:
-                raise InvalidValueError(
-                    f"a decision of about {estimated:.3g} {unit} {what}: this service takes at "
-                    f"most {limit:.3g} {unit} ({option}). It has {describe_cost(problem, planning)}"
-                )
+        seconds = max(reached.seconds, sensing.seconds)
+        num_bytes = max(reached.num_bytes, sensing.num_bytes)
+        too_much = None
+        if seconds > limits.max_decision_s:
+            most = f"{limits.max_decision_s:.3g} s (--max-decision-s)"
+            too_much = f"{seconds:.3g} s on one core", most
+        elif num_bytes > limits.max_decision_bytes:
+            most = f"{limits.max_decision_bytes / 2**20:.3g} MB (--max-decision-mb)"
+            too_much = f"{num_bytes / 2**20:.3g} MB of memory", most
+        if too_much is not None:
+            raise InvalidValueError(
+                f"a decision of about {too_much[0]}: this service takes at most {too_much[1]}. "
+                f"It has {describe_cost(problem, self.planning)}"
+            )
         if self.kind == "task":
             return reached
-        return Cost(reached.seconds + price.sensing.seconds, longest.num_bytes)
+        return Cost(reached.seconds + sensing.seconds, num_bytes)
 
     def _computed(self, problem: Problem) -> JobResult:
         planning, request = self.planning, self.request

@@ -72,18 +72,18 @@ class Lanes:
     @property
     def num_waiting(self) -> int:
         """Tasks not yet begun."""
-        return sum(lane.num_waiting for lane in self._lanes)
+        return sum(lane.waiting.num for lane in self._lanes)
 
     @property
     def num_running(self) -> int:
         """Tasks that workers have."""
-        return sum(lane.num_running for lane in self._lanes)
+        return sum(len(lane.running) for lane in self._lanes)
 
     def is_alone(self, task: PendingTask) -> bool:
         """Return whether a task that is to be started may have all cores."""
         if task.lane == LONG and self._fewer == 1:
             return True  # no other long one runs beside it
-        return not any(lane.num_running or lane.num_waiting for lane in self._lanes)
+        return not any(lane.running or lane.waiting.num for lane in self._lanes)
 
     def most_s(self, task: PendingTask) -> float:
         """Return how long a job of a task may compute."""
@@ -101,10 +101,10 @@ class Lanes:
     def take(self, now: float) -> PendingTask | None:
         """Remove and return the next task; None if none waits or no thread is free."""
         for number, lane in enumerate(self._lanes):
-            if not lane.num_waiting:
+            if not lane.waiting.num:
                 continue
             room_bytes = math.inf
-            if number == LONG and lane.num_running:
+            if number == LONG and lane.running:
                 room_bytes = self._limits.max_decision_bytes - lane.running_bytes
             if (task := lane.take(now, room_bytes)) is not None:
                 return task
@@ -112,7 +112,7 @@ class Lanes:
 
     def with_job(self, job: Job) -> RequestQueue | None:
         """Return the lane of which a worker has a job; None if it was forgotten."""
-        return next((lane for lane in self._lanes if lane.runs(job)), None)
+        return next((lane for lane in self._lanes if job in lane.running), None)
 
     def enqueue(self, task: PendingTask) -> None:
         """Queue a task of its session in its lane."""
@@ -173,5 +173,5 @@ class Lanes:
     def cancel_all(self) -> None:
         """End all jobs that run, because nobody remembers them."""
         for lane in self._lanes:
-            for job, _ in lane.running():
+            for job in lane.running:
                 job.cancel()

@@ -147,11 +147,15 @@ class PendingTask:
         self.num_bytes = cost.num_bytes
         self.cost_s = self._expected_s()
 
-    def predicted_s(self) -> float:
+    def starts_at(self) -> PlanningState | None:
+        """Return the nearest state that is held before its own; None if there is none."""
+        request = self.request
+        if request is None or request.checkpoint is not None:
+            return self.state
+        return self.session.state_before(request)
+
+    def predicted_s(self, state: PlanningState | None) -> float:
         """Return how long it takes on a free core; infinite if that is unknown, or not short."""
-        request, state = self.request, self.state
-        if request is not None and request.checkpoint is None:
-            state = self.session.state_before(request)
         typical_s = self.expected_time.typical_s
         return typical_s if typical_s <= SHORT_S and self._is_typical(state) else math.inf
 
@@ -217,6 +221,7 @@ class Session:
         sensing_time: ExpectedTime,
     ) -> None:
         self.key = key
+        self.owner = key[0]
         self.epoch = request.epoch
         self.number = -1  # of the newest request in this epoch; -1 before the first
         # Packed, it is one object instead of thousands, all of which the collector would look at
@@ -251,7 +256,8 @@ class Session:
         self.company = _digest_of((self.problem_key, configuration.planning))
         self.seed = configuration.seed
         self.served = False  # whether the robot got an answer
-        # acknowledged, ahead: the state last asked about, and that at the next sensing step.
+        # acknowledged, ahead: the state last asked about, and that at the next sensing step. The
+        # first is None if it was asked about by an earlier process of the robot.
         self.acknowledged: PlanningState | None = None
         self.ahead: PlanningState | None = None
         self.ahead_digest = b""
@@ -264,11 +270,6 @@ class Session:
         self.num_bytes = 0  # counted size of states and answers
         self.used_at = 0.0  # time of the last request or result
         self.closed = False
-
-    @property
-    def owner(self) -> Owner:
-        """Name in its certificate, or None."""
-        return self.key[0]
 
     def lane_of(self, request: Request | None) -> int:
         """Return the lane in which a task begins.
@@ -297,14 +298,21 @@ class Session:
 
     def state_before(self, request: Request) -> PlanningState | None:
         """Return the nearest state before the request's; None if there is none."""
-        held = (self.ahead, self.acknowledged)
-        return next((known for known in held if _connects(known, request)), None)
+        asked = request.step, request.sensed
+        for known in self._states():
+            if known is None or known.trial != request.trial:
+                continue
+            if (known.step, known.sensed) <= asked:
+                return known
+        return None
 
     def knows_trial(self, trial: int) -> bool:
         """Return whether a state of the trial is held."""
-        return any(
-            known is not None and known.trial == trial for known in (self.ahead, self.acknowledged)
-        )
+        return any(known is not None and known.trial == trial for known in self._states())
+
+    def _states(self) -> tuple[PlanningState | None, ...]:
+        """Return the states from which it may go on, the later first."""
+        return () if self.acknowledged is None else (self.ahead, self.acknowledged)
 
     def size(self) -> int:
         """Return the bytes of its states and answers."""
@@ -543,12 +551,3 @@ def with_cores(planning: PlanningSettings, num_cores: int) -> PlanningSettings:
 
 def _size_of(state: PlanningState | None) -> int:
     return 0 if state is None else state.belief.states.nbytes + state.belief.weights.nbytes
-
-
-def _connects(state: PlanningState | None, request: Request) -> bool:
-    """Return whether a state is of the request's trial and not after the request's."""
-    return (
-        state is not None
-        and state.trial == request.trial
-        and (state.step, state.sensed) <= (request.step, request.sensed)
-    )

@@ -320,7 +320,8 @@ class ServiceShell:
     def _carry_out(self, effects: list[ServiceEffect], now: float) -> None:
         self._perform(effects)
         self._perform(self._service.next_jobs(now))  # the replies are on their way
-        self._set_timer()
+        if not self._brief_jobs or len(self._calls) > 1:
+            self._set_timer()  # for a lone robot after its job, which stands in the next turn
         self._note_if_idle()
 
     def _perform(self, effects: list[ServiceEffect]) -> None:
