@@ -85,6 +85,8 @@ double seconds_since(std::chrono::steady_clock::time_point start) {
 void holdfast::bind_entropy(nb::module_& module) {
     define(module, "use_threads_from",
            [](double nanoseconds) { return use_threads_from(nanoseconds); });
+    module.attr("few_up_to") = initially_few_up_to;
+    module.attr("sample_of_groups") = sample_of_groups;
     define(module, "take_as_few_up_to",
            [](std::size_t points) { return take_as_few_up_to(points); });
     define(module, "threads_started", [] { return threads_started(); });

@@ -34,11 +34,10 @@ constexpr double cost_of_making = 80.0;  // the tree and the group, of it
 // Points up to which all terms are added, and a tree's leaves are taken one by one. Beyond it the
 // terms are those of a sample, if the settings say so, and a tree's leaves are taken in blocks:
 // faster where the points are dense, but sums are rounded otherwise. So this number changes bits.
-std::atomic<std::size_t> few_up_to{16384};
-// Points in the sample for the groups of a batch, and in that for a posterior with its own tree.
+std::atomic<std::size_t> few_up_to{initially_few_up_to};
+// Points in the sample for a posterior with its own tree; that for the groups is in the header.
 // They are chosen for 100,000 particles: a decision with the largest errors that still takes less
 // than a second of two threads (docs/decisions/many_entropies.md).
-constexpr double sample_of_groups = 2048.0;
 constexpr double sample_of_one = 512.0;
 constexpr double fewest_of_a_posterior = 128.0;
 // Nanoseconds for each likelihood, with the entropies that follow.

@@ -26,6 +26,11 @@
 
 namespace holdfast {
 
+// Points up to which no sample stands for all, and points in the sample for the groups of a batch.
+// The estimate of what a decision costs uses them, too.
+inline constexpr std::size_t initially_few_up_to = 16384;
+inline constexpr double sample_of_groups = 2048.0;
+
 enum class Estimator { nearest_neighbor, gaussian_mixture, total_variance, prior_neighbors };
 
 struct EntropySettings {

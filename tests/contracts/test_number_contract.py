@@ -292,6 +292,12 @@ def test_what_a_problem_returns_with_a_mask(function: str) -> None:
         trial(hf.Planner(kind(), SETTINGS))
 
 
+def test_a_mask_that_hides_nothing_goes_no_further() -> None:
+    drawn = np.ma.array(np.zeros((SETTINGS.particle_filter.num_particles, 2)))
+    kind = type("Unmasked", (Gaussian,), {"initial_states": lambda *_: drawn})
+    assert type(hf.Planner(kind(), SETTINGS).init(1).belief.states) is np.ndarray
+
+
 class Gaussian(Line):
     """A line with a reward."""
 

@@ -120,7 +120,7 @@ FEW_UP_TO = 16_384
 @contextmanager
 def in_blocks() -> Iterator[None]:
     """Let trees of any size be taken in blocks."""
-    assert _kernel.take_as_few_up_to(0) == FEW_UP_TO
+    assert _kernel.take_as_few_up_to(0) == FEW_UP_TO == _kernel.few_up_to
     try:
         yield
     finally:

@@ -17,12 +17,11 @@ import numpy as np
 import pytest
 import yaml
 from tests.processes.faults import LOST, PATIENT, RESTORED, Site, assert_identical, wait_until
+from tests.unit.test_trial import one
 
 from holdfast.config.loader import load
-from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.robot.environment_maker import load_environment
-from holdfast.robot.trial import run_trial
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_robot"
 PATIENCE_S = 60.0
@@ -210,11 +209,5 @@ def test_the_simulation_has_the_same_file() -> None:
     configuration = load(EXAMPLE / "own_robot.yaml")
     maker = load_environment(configuration)
     assert maker.simulated
-    result = run_trial(
-        Planner(configuration.problem, configuration.planning),
-        configuration.simulator.seed,
-        0,
-        max_steps=configuration.simulator.max_steps,
-        environment=maker(0),
-    )
+    result = one(configuration, environment=maker(0))
     assert result.success

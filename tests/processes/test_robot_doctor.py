@@ -252,9 +252,16 @@ class TestTheWay:
         assert_fails(look(f"unix/{tmp_path / 's'}"), "name", "is not there")
 
     @pytest.mark.parametrize(("protocol", "more"), [("tcp", ""), ("tls", " --tls KEYS/service; ")])
-    def test_a_port_at_which_nothing_listens(self, protocol: str, more: str, look: Look) -> None:
+    def test_a_port_at_which_nothing_listens(
+        self, protocol: str, more: str, site: Site, look: Look
+    ) -> None:
         endpoint = f"{protocol}/127.0.0.1:{free_port()}"
         assert_fails(look(endpoint), "port", "refused", f"holdfast serve --listen {endpoint}{more}")
+        shutil.copy(test_other_code.EXAMPLE, site.directory)
+        seen = look(endpoint, site.configure(test_other_code.DOCUMENT))
+        assert (
+            f"--listen {endpoint} --problem {test_other_code.NAME}{more}" in seen["port"]["advice"]
+        )
 
     def test_a_port_that_does_not_answer(self, look: Look) -> None:
         with contextlib.ExitStack() as stack:

@@ -70,6 +70,18 @@ holdfast.cli.main()
     assert "pip uninstall holdfast; pip install --force-reinstall --no-deps" in done.stderr
 
 
+def test_ctrl_c_while_a_class_is_made() -> None:
+    program = """
+import holdfast.cli
+
+def load(arguments):
+    raise RuntimeError("Error calling __set_name__") from KeyboardInterrupt()  # as Python 3.11 does
+
+holdfast.cli.main(load)
+"""
+    assert (python(program).returncode, python(program).stderr) == (130, "")
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_in_order(number: signal.Signals) -> None:
     before = signal.getsignal(number)

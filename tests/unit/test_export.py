@@ -24,6 +24,7 @@ from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.typesys import Stores, get_typestore
 from tests.answers import answers_in
 from tests.command_line import Said, done_here, run_here
+from tests.unit.test_trial import one
 
 import holdfast as hf
 from holdfast.config.loader import Configuration, load
@@ -33,9 +34,9 @@ from holdfast.journal.journal import Journal
 from holdfast.planning.belief import Belief
 from holdfast.planning.inputs import ActingRecord, Moved, Sensed, encode_floats
 from holdfast.planning.outcome import TrialResult
-from holdfast.planning.planner import Planner, PlanningState
+from holdfast.planning.planner import PlanningState
 from holdfast.reports.poses import PoseLayout, pose_layout
-from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
+from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver
 
 PEG = """\
 problem: peg_in_hole_2d
@@ -131,13 +132,7 @@ def seen_in(configuration: Configuration, trials: range) -> list[Seen]:
     """Run trials once more, without the exporter."""
     observers = [Seen() for _ in trials]
     for trial, observer in zip(trials, observers, strict=True):
-        run_trial(
-            Planner(configuration.problem, configuration.planning),
-            configuration.simulator.seed,
-            trial,
-            max_steps=configuration.simulator.max_steps,
-            observer=observer,
-        )
+        one(configuration, trial, observer=observer)
     return observers
 
 

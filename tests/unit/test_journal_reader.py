@@ -6,6 +6,7 @@ from typing import Any
 import msgspec
 import pytest
 from tests.recordings import failed, result_of, without_decisions
+from tests.unit.test_trial import one
 
 from holdfast.config.loader import load
 from holdfast.errors import OutputError
@@ -15,7 +16,6 @@ from holdfast.journal.journal_reader import JournalReader
 from holdfast.planning.outcome import Decisions
 from holdfast.planning.planner import Planner
 from holdfast.planning.tracking import replay
-from holdfast.robot.trial import run_trial
 
 BEFORE_OUTCOMES = Path(__file__).parent / "data" / "journal_before_outcomes.sqlite"
 """A robot was killed at step 21 of trial 2, when results said only whether a trial succeeded."""
@@ -75,12 +75,7 @@ class TestJournal:
             (tmp_path / "old.yaml").write_text(journal.meta()["configuration"])
             configuration = load(tmp_path / "old.yaml")
             for result in results:
-                again = run_trial(
-                    Planner(configuration.problem, configuration.planning),
-                    configuration.simulator.seed,
-                    result.trial,
-                    max_steps=configuration.simulator.max_steps,
-                )
+                again = one(configuration, result.trial)
                 assert again.digest == result.digest
                 assert again.outcome == result.outcome
             unfinished = journal.unfinished()

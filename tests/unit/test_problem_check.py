@@ -16,7 +16,7 @@ from holdfast.config import registry
 from holdfast.errors import InvalidValueError
 from holdfast.planning.settings import PlanningSettings, SelectorSettings
 from holdfast.problems.attributes import PARAMETERS
-from holdfast.tuning.findings import CONTRACT, OVER, WHERE, Finding
+from holdfast.tuning.findings import CONTRACT, OVER, WHERE, Finding, Inspection
 from holdfast.tuning.problem_check import CHECKS, check_problem
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -374,6 +374,15 @@ def test_the_same_seed_finds_the_same_and_says_what_it_does() -> None:
     assert [each for each in first if each.check != "time"] == [
         each for each in again if each.check != "time"
     ]
+
+
+def test_standard_deviations_are_right_to_two_digits() -> None:
+    for seed in range(10):
+        inspection = Inspection(Rover(), PlanningSettings(), 200, seed, LONG_S)
+        CHECKS["contract"](inspection)
+        (noises,) = [each.seen for each in inspection.findings if each.check == "noises"]
+        told = re.findall(r"initial belief \w+ ([\d.]+), \w+ ([\d.]+);", noises)
+        assert np.array(told, float) == pytest.approx(0.5, abs=0.02), noises
 
 
 def test_a_constant_reward_is_an_error_where_it_is_asked_for() -> None:

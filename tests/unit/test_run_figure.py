@@ -3,7 +3,10 @@
 Where the trial is first decided otherwise then, and which service had decided.
 """
 
+import errno
+import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from tests.command_line import PEG, Workplace
@@ -20,25 +23,22 @@ from holdfast.protocol.robot_events import Timing
 from holdfast.reports.recorder import Recorder
 
 
-def test_the_figure_of_any_trial_in_three_formats(workplace: Workplace) -> None:
+def test_the_figure_of_any_trial_in_three_formats(
+    workplace: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
     workplace.write("peg.yaml", PEG)
     assert (
         workplace.run("run", "peg.yaml", "--jobs", "1", "--trials", "3", "--out", "out").code == 0
     )
     drawn = {}
-    for name, trials, beginning in (
-        ("one.pdf", "1", b"%PDF"),
-        ("one.png", "1", b"\x89PNG"),
-        ("one.svg", "1", b"<?xml"),
-        ("again.svg", "1:3", b"<?xml"),
-        ("again.pdf", "1:3", b"%PDF"),
-        ("two.svg", "2", b"<?xml"),
-    ):
+    begins = {"pdf": b"%PDF", "png": b"\x89PNG", "svg": b"<?xml"}
+    names = {**{f"one.{kind}": "1" for kind in begins}, "two.svg": "2"}
+    for name, trials in {**names, "again.svg": "1:3", "again.pdf": "1:3"}.items():
         words = ["export", "out", "--figure", name, "--trials", trials]
         said = workplace.run(*words, figures=True)
         assert (said.code, name in said.stdout) == (0, True), said.stderr
         drawn[name] = (workplace.directory / name).read_bytes()
-        assert drawn[name].startswith(beginning)
+        assert drawn[name].startswith(begins[name[-3:]])
     for kind in ("svg", "pdf"):  # the first of the trials, whenever it is drawn
         assert drawn[f"one.{kind}"] == drawn[f"again.{kind}"]
     assert drawn["one.svg"] != drawn["two.svg"]
@@ -49,6 +49,9 @@ def test_the_figure_of_any_trial_in_three_formats(workplace: Workplace) -> None:
     ):
         said = workplace.run("export", "out", *words, figures="new.png" not in words)
         assert (said.code, message in said.stderr) == (2, True), said.stderr
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(errno.ENOSPC, "No space left")))
+    said = workplace.run("export", "out", "--figure", "new.pdf", figures=True)
+    assert "error: new.pdf: cannot be written: No space left" in said.stderr
 
 
 def test_without_matplotlib_a_note_says_so(workplace: Workplace) -> None:

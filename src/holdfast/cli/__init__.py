@@ -35,7 +35,6 @@ def main(application: Callable[[Sequence[str]], int] | None = None) -> None:
         ignore_unwritable_stderr,
         replace_closed_streams,
     )
-    from holdfast.errors import HoldfastError
     from holdfast.runtime.descriptors import allow_descriptors
 
     replace_closed_streams()
@@ -64,16 +63,20 @@ def main(application: Callable[[Sequence[str]], int] | None = None) -> None:
         finally:
             sys.stdout.flush()
         sys.exit(code)
-    except HoldfastError as error:
-        from holdfast.cli.exit_codes import EXIT_ERROR, print_error
-        from holdfast.errors import RunError
+    except (Exception, KeyboardInterrupt) as error:
+        from holdfast.cli.exit_codes import EXIT_ERROR, EXIT_SIGNAL, print_error, signal_of
+        from holdfast.errors import HoldfastError, RunError
 
+        # While a class is made, Python 3.11 raises a RuntimeError from Ctrl-C.
+        cause: BaseException | None = error
+        while cause is not None:
+            if isinstance(cause, KeyboardInterrupt):
+                sys.exit(EXIT_SIGNAL + signal_of(cause))
+            cause = cause.__cause__
+        if not isinstance(error, HoldfastError):
+            raise
         print_error(error, arguments, "service" if is_service else "robot")
         sys.exit(error.exit_code if isinstance(error, RunError) else EXIT_ERROR)
-    except KeyboardInterrupt as interruption:
-        from holdfast.cli.exit_codes import EXIT_SIGNAL, signal_of
-
-        sys.exit(EXIT_SIGNAL + signal_of(interruption))
 
 
 def _print_defect(

@@ -79,8 +79,9 @@ def main(arguments: Sequence[str]) -> int:
             check_credentials(endpoint, TlsFiles.of(Path(offload.tls)))
     if not endpoints:
         raise HoldfastError("no service is named: give --service ENDPOINT, or CONFIG one")
-    decisions = None
+    decisions, problem = None, ""
     if configuration is not None:
+        problem = configuration.problem_name
         decisions = in_thread(functools.partial(reference_decisions, configuration))
     fails = False
     for endpoint in endpoints:
@@ -97,7 +98,7 @@ def main(arguments: Sequence[str]) -> int:
 
         if not options.json:
             sys.stdout.write(f"{endpoint}\n")
-        asyncio.run(Examination(endpoint, offload, decisions, show).run())
+        asyncio.run(Examination(endpoint, offload, decisions, show, problem).run())
     return EXIT_DIFFERENT if fails else 0
 
 

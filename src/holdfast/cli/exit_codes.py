@@ -92,7 +92,7 @@ def ended_by_signals(*, once: bool = False) -> Iterator[None]:
         # A second signal must not cut the orderly end short. A handler that does nothing, because
         # Python complains of a pending signal that is set to SIG_IGN.
         for handled in saved:
-            signal.signal(handled, _ignore)
+            signal.signal(handled, lambda *_: None)
         raise EndedBySignal(number)
 
     # A signal that is ignored from the start stays ignored, as nohup expects.
@@ -113,15 +113,9 @@ def ended_by_signals(*, once: bool = False) -> Iterator[None]:
             signal.signal(number, signal.SIG_IGN if once and ended else before)
 
 
-def _ignore(number: int, frame: object) -> None:
-    del number, frame
-
-
 def signal_of(interruption: KeyboardInterrupt) -> signal.Signals:
     """Return the signal that interrupted."""
-    if isinstance(interruption, EndedBySignal):
-        return interruption.signal
-    return signal.SIGINT
+    return interruption.signal if isinstance(interruption, EndedBySignal) else signal.SIGINT
 
 
 def interrupted_by(interruption: KeyboardInterrupt) -> str:

@@ -209,9 +209,7 @@ def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions)
         if options.figure is not None:
             from holdfast.reports.figure import trial_figure
 
-            picture = stack.enter_context(directory_beside(options.figure)) / options.figure.name
-            trial_figure(recorded.configuration, first.record, picture)
-            made.append((picture, options.figure))
+            trial_figure(recorded.configuration, first.record, options.figure)
         for here, there in made:
             move_into_place(here, there)
     return notes

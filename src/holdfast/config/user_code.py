@@ -11,14 +11,16 @@ KeyboardInterrupt, which is Ctrl-C, and passes on what has no account here.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
+import os
 import re
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from holdfast.config.user_modules import find_in
 from holdfast.errors import ConfigurationError
@@ -54,6 +56,27 @@ def _place(name: str) -> Path:
     if installed.is_relative_to(_HOLDFAST) and installed.is_file():
         return installed
     return Path(name).resolve()
+
+
+class ProcessEndError(BaseException):
+    """The user's code has called ``os._exit``; raised there, so that its lines are known."""
+
+
+@contextlib.contextmanager
+def process_end_refused() -> Iterator[None]:
+    """Let ``os._exit`` raise in this process, which would end without a word."""
+    process, end = os.getpid(), os._exit
+
+    def refuse(status: int) -> NoReturn:
+        if os.getpid() != process:  # a forked child
+            end(status)
+        raise ProcessEndError(f"os._exit({status}) would end the process")
+
+    os._exit = refuse
+    try:
+        yield
+    finally:
+        os._exit = end
 
 
 def account_of_user_error(error: BaseException, name: str) -> str | None:
@@ -110,16 +133,11 @@ def in_words(error: BaseException) -> str:
 
 def _frames_listed(frames: list[traceback.FrameSummary]) -> str:
     # A recursion has a thousand of them; a few from its beginning and its end are enough.
-    if len(frames) > 2 * _MAX_FRAMES:
-        left_out = len(frames) - 2 * _MAX_FRAMES
-        listed = [
-            *traceback.format_list(frames[:_MAX_FRAMES]),
-            f"  ... {left_out} more\n",
-            *traceback.format_list(frames[-_MAX_FRAMES:]),
-        ]
-    else:
-        listed = traceback.format_list(frames)
-    return "".join(listed).rstrip()
+    left_out = len(frames) - 2 * _MAX_FRAMES
+    if left_out <= 0:
+        return "".join(traceback.format_list(frames)).rstrip()
+    first, last = map(traceback.format_list, (frames[:_MAX_FRAMES], frames[-_MAX_FRAMES:]))
+    return "".join([*first, f"  ... {left_out} more\n", *last]).rstrip()
 
 
 def describe_problem_error(name: str, error: BaseException) -> str:
@@ -131,9 +149,7 @@ def registered_names(group: str) -> list[str]:
     """Return the names of a group of entry points, sorted."""
     import importlib.metadata
 
-    return sorted(
-        {entry_point.name for entry_point in importlib.metadata.entry_points(group=group)}
-    )
+    return sorted({each.name for each in importlib.metadata.entry_points(group=group)})
 
 
 def find_class(

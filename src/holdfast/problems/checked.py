@@ -241,7 +241,7 @@ def _shown(problem: Any, function: str, *arguments: object, what: str = "") -> F
             f"{function} of {name_of(problem)} returned {in_brief(value)} of {value.size} "
             f"coordinates: need 1 to {MAX_OBSERVATION_SIZE}, all of them finite"
         )
-    return value.copy()
+    return np.array(value)
 
 
 def policy(problem: Any, states: FloatArray, stage: int | IntArray) -> FloatArray:
@@ -466,7 +466,7 @@ def _ask(problem: Any, function: str, *arguments: object) -> Any:
 def _array(problem: Any, function: str, value: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     if not _is_float_array(value) or value.shape != shape:
         raise _misfit(problem, function, value, shape)
-    return value.copy()
+    return np.array(value, order="C")  # of no other class, such as a masked array
 
 
 def _finite(problem: Any, function: str, value: Any, shape: tuple[int, ...]) -> FloatArray:

@@ -18,6 +18,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+from holdfast import _kernel
 from holdfast.planning.expected_return import has_own_rollouts
 from holdfast.planning.settings import (
     ENTROPY_METHODS,
@@ -155,8 +156,8 @@ _NEAREST_ALONE, _NEAREST_TOGETHER, _GROUP = 420.0, 90.0, 32
 """For a point's neighbours in one posterior alone, and in one of a group of this size."""
 _NEIGHBOR, _SQUARED_NEIGHBOR = 50.0, 0.17
 """For each neighbour beyond five; many are kept in order, so the square counts too."""
-_FEW, _SAMPLE, _SAMPLED_PAIR, _SAMPLED_WEIGHT = 16_384.0, 2048.0, 1.2, 15.0
-"""Of more particles, terms that stand for all; for a pair of one and a particle; for a weight."""
+_SAMPLED_PAIR, _SAMPLED_WEIGHT = 1.2, 15.0
+"""For a pair of a term of the kernel's sample and a particle; for a weight."""
 _MIXTURE_PAIR = 0.28
 _PRIOR_PAIR, _PRIOR_MEMBER, _PRIOR_LANES = 4.0, 4.0, 8
 _ADD = 2.0
@@ -248,7 +249,7 @@ class _Sizes:
         kind = estimator_of(selector, int(particles))
         neighbors = min(float(self.planning.active_sensing.num_nearest_neighbors), particles)
         wide = 1.0 + max(0.0, dimension - 3.0) / 3.0
-        terms = particles if particles <= _FEW else _SAMPLE
+        terms = particles if particles <= _kernel.few_up_to else _kernel.sample_of_groups
         groups = math.ceil(posteriors / _GROUP)
         if kind == "nearest_neighbor":
             together = min(posteriors, float(_GROUP))

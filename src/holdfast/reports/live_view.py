@@ -11,7 +11,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Self, TypeAlias
+from typing import TYPE_CHECKING, Self
 
 import msgspec
 
@@ -32,8 +32,6 @@ _CLOSE_S = 10.0
 
 _REPORT = msgspec.msgpack.Decoder(FollowerReport)
 
-_Work: TypeAlias = Callable[..., None]
-
 
 class LiveView:
     """Shows a run while it goes on, from its ``directory``, where its journal is.
@@ -48,13 +46,13 @@ class LiveView:
         target: ViewTarget,
         directory: Path,
         on_note: Callable[[str], None],
-        work: _Work = follow,
+        work: Callable[..., None] = follow,
     ) -> None:
         arguments = (configuration.plain(), tuple(target), str(directory))
         self._worker = WorkerProcess("holdfast-view", work, arguments, threads=1)
         self._on_note = on_note
         self._waiting = threading.Thread(target=self._wait, daemon=True)
-        self._is_over = False
+        self._is_over = self._gave_up = False
 
     def __enter__(self) -> Self:
         """Start the other process, and wait until the viewer is there.
@@ -80,7 +78,7 @@ class LiveView:
         self._waiting.join(_CLOSE_S)
         if self._waiting.is_alive():
             self._on_note(f"the view was not complete {_CLOSE_S:g} s after the run")
-            self._on_note = lambda _: None
+            self._gave_up = True
             self._worker.kill()  # not yet awaited here: of two threads one would find no child
             self._waiting.join()
         end_workers([self._worker])
@@ -94,7 +92,7 @@ class LiveView:
 
     def _wait(self) -> None:
         report = self._report()
-        if report.error is not None:
+        if report.error is not None and not self._gave_up:
             rest = "" if self._is_over else "; the run goes on without it"
             self._on_note(f"the view has ended: {report.error}{rest}")
         elif report.left_out:

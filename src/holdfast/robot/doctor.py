@@ -131,7 +131,7 @@ class Examination:
     """The check of all layers between a robot and a service; ``report`` gets each finding at once.
 
     The robot's name, credentials and limits on time are in ``offload``. Without ``decisions`` the
-    service is asked for none.
+    service is asked for none; they are of the ``problem``.
     """
 
     def __init__(
@@ -140,11 +140,11 @@ class Examination:
         offload: OffloadSettings,
         decisions: Future[list[ReferenceDecision]] | None,
         report: Callable[[LayerFinding], None],
+        problem: str = "",
     ) -> None:
-        self._endpoint = endpoint
-        self._offload = offload
-        self._decisions = decisions
-        self._report = report
+        self._endpoint, self._offload = endpoint, offload
+        self._decisions, self._report = decisions, report
+        self._to_serve = f" --problem {problem}" if ":" in problem else ""
         self._layer = "name"
         self._paths: list[AddressPath] = []
         self._going_on: list[AddressPath] = []
@@ -248,7 +248,7 @@ class Examination:
         except ConnectionRefusedError as error:
             own = endpoint.is_local_socket or endpoint.is_loopback
             at = endpoint if own else f"{endpoint.protocol}/0.0.0.0:{endpoint.port}"
-            advice = f"start the service there: holdfast serve --listen {at}"
+            advice = f"start the service there: holdfast serve --listen {at}{self._to_serve}"
             if endpoint.is_encrypted:
                 advice += " --tls KEYS/service; 'holdfast keys KEYS' makes both ends' credentials"
             raise _LayerError(f"{what}: refused, nothing listens there", advice) from error

@@ -260,7 +260,7 @@ class TrialPool:
             if worker.outstanding and (
                 len(worker.outstanding) == _MAX_LOOKAHEAD
                 or worker.expected_s + expected_s > _LOOKAHEAD_S
-                or not worker.has(arm)
+                or arm not in worker.arms
             ):
                 return
             worker.send_trial(arm, trial, expected_s)
@@ -406,18 +406,14 @@ class _Worker(WorkerProcess):
             self._process = RayProcess(cluster, _Runner, self._theirs, threads)
         self.outstanding: deque[tuple[Arm, int, float]] = deque()
         self.expected_s = self.began_s = 0.0
-        self._arms: dict[Arm, int] = {}
-
-    def has(self, arm: Arm) -> bool:
-        """Return whether it was sent the arm."""
-        return arm in self._arms
+        self.arms: dict[Arm, int] = {}  # those that it was sent
 
     def send_trial(self, arm: Arm, trial: int, expected_s: float) -> None:
         # If it is dead, its pipe tells when it is read, where we know which trial it had.
-        new = b"" if arm in self._arms else _pickled(arm)
+        new = b"" if arm in self.arms else _pickled(arm)
         if not self.outstanding:
             self.began_s = perf_counter() + (_BUILD_S if new else 0.0)
-        number = self._arms.setdefault(arm, len(self._arms))
+        number = self.arms.setdefault(arm, len(self.arms))
         self.outstanding.append((arm, trial, expected_s))
         self.expected_s += expected_s
         self.send(_ENCODE(_Trial(number, trial, new)))

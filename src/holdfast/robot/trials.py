@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 
 from holdfast.config.loader import Configuration
+from holdfast.config.user_code import process_end_refused
 from holdfast.planning.outcome import TrialResult
 from holdfast.robot.trial import NULL_OBSERVER, TrialObserver
 from holdfast.robot.trial_pool import Arm, TrialPool
 
 
+@process_end_refused()
 def run_trials(
     configuration: Configuration,
     jobs: int,
@@ -23,7 +25,6 @@ def run_trials(
     Raises what :meth:`TrialPool.run` raises; KeyboardInterrupt after the workers have been ended.
     """
     num_trials = configuration.simulator.num_trials
-    finished = finished if isinstance(finished, (set, frozenset, range)) else set(finished)
     remaining = num_trials - sum(1 for trial in finished if 0 <= trial < num_trials)
     arm = Arm.of(configuration)
     with TrialPool(jobs, expected=remaining, observer=observer) as pool:

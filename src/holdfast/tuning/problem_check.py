@@ -30,6 +30,7 @@ from holdfast.tuning.trial_check import check_decision_time, check_goals, check_
 from holdfast.validation import as_function
 
 _STATES = 48
+_DRAWN = 4000  # states whose standard deviation is told, off by a hundredth
 _NEEDED = ("limit_action", "next_stage", "reward", "scene", "resolution", "state_labels")
 
 
@@ -133,13 +134,12 @@ def _declarations(inspection: Inspection) -> None:
 def _contract(inspection: Inspection) -> None:
     """Check the contract in initial states, and say what was understood of noises."""
     problem, own = inspection.problem, inspection.random(0)
-    states = inspection.ask("initial_states", checked.initial_states, problem, own, 200)
+    states = inspection.ask("initial_states", checked.initial_states, problem, own, _DRAWN)
     check_contract(inspection, states[:_STATES], np.zeros(_STATES, dtype=np.int64))
     names = [inspection.coordinate(at) for at in range(min(states.shape[1], 8))]
     initial = ", ".join(f"{name} {states[:, at].std():.2g}" for at, name in enumerate(names))
-    noise = ", ".join(f"{each:.2g}" for each in np.sqrt(np.ravel(problem.motion_variance)))
     seen = f"standard deviations: of the initial belief {initial}; of the motion noise of a step "
-    seen += noise
+    seen += ", ".join(f"{each:.2g}" for each in np.sqrt(np.ravel(problem.motion_variance)))
     if not attributes.has_general_observations(problem):
         shown = []
         for action, label in enumerate(attributes.sensing_labels(problem)[:8]):
