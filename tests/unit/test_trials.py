@@ -72,12 +72,6 @@ class TestManyTrials:
         with pytest.raises(TrialError, match=r"trial 2 \(seed 3\): too heavy"):
             run_all(configuration, jobs=1, finished=(0, 1))
 
-    def test_what_would_end_the_process_ends_the_trial(self, tmp_path: Path) -> None:
-        code = "os.waitstatus_to_exitcode(os.waitpid(os.fork() or os._exit(7), 0)[1])"
-        configuration = failing_configuration(tmp_path, f'(os := __import__("os"))._exit({code})')
-        with pytest.raises(TrialError, match=r"raised ProcessEndError: os\._exit\(7\) would end"):
-            run_all(configuration, jobs=1)
-
     def test_a_defect_without_a_frame_of_the_problem_is_raised_as_it_is(
         self, tmp_path: Path
     ) -> None:

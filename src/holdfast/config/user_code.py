@@ -11,16 +11,14 @@ KeyboardInterrupt, which is Ctrl-C, and passes on what has no account here.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import importlib
-import os
 import re
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from holdfast.config.user_modules import find_in
 from holdfast.errors import ConfigurationError
@@ -56,27 +54,6 @@ def _place(name: str) -> Path:
     if installed.is_relative_to(_HOLDFAST) and installed.is_file():
         return installed
     return Path(name).resolve()
-
-
-class ProcessEndError(BaseException):
-    """The user's code has called ``os._exit``; raised there, so that its lines are known."""
-
-
-@contextlib.contextmanager
-def process_end_refused() -> Iterator[None]:
-    """Let ``os._exit`` raise in this process, which would end without a word."""
-    process, end = os.getpid(), os._exit
-
-    def refuse(status: int) -> NoReturn:
-        if os.getpid() != process:  # a forked child
-            end(status)
-        raise ProcessEndError(f"os._exit({status}) would end the process")
-
-    os._exit = refuse
-    try:
-        yield
-    finally:
-        os._exit = end
 
 
 def account_of_user_error(error: BaseException, name: str) -> str | None:

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 
 from holdfast.config.loader import Configuration
-from holdfast.config.user_code import process_end_refused
 from holdfast.planning.outcome import TrialResult
 from holdfast.robot.trial import NULL_OBSERVER, TrialObserver
 from holdfast.robot.trial_pool import Arm, TrialPool
 
 
-@process_end_refused()
 def run_trials(
     configuration: Configuration,
     jobs: int,

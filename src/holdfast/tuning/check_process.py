@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import multiprocessing
+import os
 import pickle
 import signal
 import sys
@@ -20,10 +21,10 @@ from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from holdfast.config.loader import Configuration
-from holdfast.config.user_code import is_users_file, process_end_refused
+from holdfast.config.user_code import is_users_file
 from holdfast.errors import HoldfastError, ProblemError, TrialCrashError
 from holdfast.runtime.workers import WorkerProcess, end_workers
 from holdfast.tuning.findings import Finding, OutOfTimeError
@@ -104,7 +105,6 @@ def _checked(
     return check_problem(found.problem, found.planning, max_steps=limit, on_check=on_check, **how)
 
 
-@process_end_refused()
 def _work(
     connection: Connection, load: Callable[[], Configuration], patience: float, how: dict[str, Any]
 ) -> None:
@@ -113,6 +113,7 @@ def _work(
     def tell(message: object) -> None:
         connection.send_bytes(pickle.dumps(message))
 
+    os._exit = _refuse_to_end
     try:
         # What the problem's code prints is no finding.
         with contextlib.redirect_stdout(sys.stderr), _clock(how["budget_s"], patience):
@@ -121,6 +122,14 @@ def _work(
         tell(error)
     except Exception:  # noqa: BLE001 - whatever it is, the parent raises it again
         tell(TrialCrashError(f"in the process of the check:\n{traceback.format_exc()}"))
+
+
+class ProcessEndError(BaseException):
+    """The problem's code has called ``os._exit``; raised there, so that its lines are known."""
+
+
+def _refuse_to_end(status: int) -> NoReturn:
+    raise ProcessEndError(f"os._exit({status}) would end the process")
 
 
 @contextlib.contextmanager
