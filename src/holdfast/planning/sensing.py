@@ -314,9 +314,10 @@ def _on_a_line(problem: Problem, settings: PlanningSettings, sets: FloatArray) -
 def _estimator(
     problem: Problem, settings: PlanningSettings, belief: Belief, points: FloatArray
 ) -> estimators.KernelEstimator:
-    _require_bounded(problem, points, belief.states, "state")
-    dimension = points.shape[1]
     selector = settings.selector
+    if selector.method != "path_entropy":  # whose points have been checked
+        _require_bounded(problem, points, belief.states, "state")
+    dimension = points.shape[1]
     of_states = selector.method == "state_entropy"
     resolution = attributes.resolution_of(problem, selector.resolution, of_states=of_states)
     each_its_own = not isinstance(resolution, (int, float))
