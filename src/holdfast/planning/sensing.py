@@ -177,11 +177,10 @@ def choose_sensing_action(
     sets, factors, shown = predictions or predict(problem, settings, belief.states, stage)
     estimator = _estimator(problem, settings, belief, sets[0])
     sets = _on_a_line(problem, settings, sets)
-    points = sets.reshape(-1, sets.shape[-1])
     threads, size = sensing.num_cores, sensing.num_observation_samples
     hypothetical = _hypotheses_of(problem, belief, shown)(range(count), size, hypotheses)
     entropies, samples, likelihoods, visits = hypothetical.entropies(
-        estimators.scaled(points, estimator),
+        estimators.scaled(sets.reshape(-1, sets.shape[-1]), estimator),
         estimator,
         threads,
         factors,
