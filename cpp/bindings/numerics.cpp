@@ -30,10 +30,15 @@ using AnyArray = nb::ndarray<const Value, nb::c_contig, nb::device::cpu>;
 /// False for a NaN.
 template <class Value>
 bool all_within(const AnyArray<Value>& in, Value least, Value most) {
+    // In an integer as wide as a value, the compiler compares several values at a time.
     const Value* values = in.data();
-    bool within = true;
-    for (std::size_t i = 0; i < in.size(); ++i) within &= least <= values[i] && values[i] <= most;
-    return within;
+    const std::size_t size = in.size();
+    std::int64_t within = 1;
+    for (std::size_t i = 0; i < size; ++i) {
+        within &= static_cast<std::int64_t>(least <= values[i]) &
+                  static_cast<std::int64_t>(values[i] <= most);
+    }
+    return within != 0;
 }
 
 bool all_finite(const AnyArray<double>& in) {

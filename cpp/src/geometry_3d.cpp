@@ -9,8 +9,6 @@
 namespace holdfast {
 namespace {
 
-constexpr double shortest_axis_squared = 1e-16;
-
 using Vector = std::array<double, 3>;
 
 // The box's axes in world coordinates: axes[k] is column k of the rotation matrix.
@@ -111,11 +109,18 @@ bool BoxWorld::collides(const double* state) const {
 }
 
 void BoxWorld::collide_each(const double* states, std::size_t count, std::uint8_t* out) const {
-    for (std::size_t n = 0; n < count; ++n) out[n] = collides(states + n * dimension) ? 1 : 0;
+    vector_kernels().boxes_collide(shape(), states, count, out);
 }
 
 RoundShape BoxWorld::round() const {
     return {bounding_radius_, obstacles_.data()->low.data(), obstacles_.size()};
+}
+
+BoxShape BoxWorld::shape() const {
+    return {{half_size_[0], half_size_[1], half_size_[2]},
+            bounding_radius_,
+            obstacles_.data()->low.data(),
+            obstacles_.size()};
 }
 
 }  // namespace holdfast

@@ -39,7 +39,7 @@ class BoxWorld {
     void collide_each(const double* states, std::size_t count, std::uint8_t* out) const;
 
     RoundShape round() const;
-    Shape shape() const { return {}; }
+    Shape shape() const;
 
   private:
     std::array<double, 3> half_size_;

@@ -5,7 +5,6 @@
 #include <atomic>
 #include <bit>
 #include <limits>
-#include <type_traits>
 #include <utility>
 
 #include "geometry_2d.hpp"
@@ -187,25 +186,17 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
             }
             for (std::size_t n = 0; n < number; ++n) collides[n] = world.collides(tested[n].data());
         };
-        // Stops those that may collide, as `stop_at_contact` does, but all of them together.
+        // Stops those that collide, as `stop_at_contact` does, but all of them together.
         const auto stop = [&](std::uint32_t hits) {
-            std::size_t left = 0, num_near = 0;
+            std::size_t left = 0;
             for (; hits != 0; hits &= hits - 1) {
                 const auto i = static_cast<std::size_t>(std::countr_zero(hits));
-                for (std::size_t c = 0; c < d; ++c) tested[num_near][c] = next[c * way_stride + i];
-                near[num_near++] = i;
-            }
-            // Boxes have not been tested side by side.
-            collides.fill(1);
-            if constexpr (std::is_same_v<typename World::Shape, BoxShape>) test(num_near);
-            for (std::size_t n = 0; n < num_near; ++n) {
-                if (collides[n] == 0) continue;
-                reached[near[n]] = 0.0;
-                blocked[near[n]] = 1.0;
-                near[left++] = near[n];
+                reached[i] = 0.0;
+                blocked[i] = 1.0;
+                near[left++] = i;
             }
             while (left > 0) {
-                num_near = std::exchange(left, 0);
+                const std::size_t num_near = std::exchange(left, 0);
                 for (std::size_t n = 0; n < num_near; ++n) {
                     const std::size_t i = near[n];
                     const double fraction = 0.5 * (reached[i] + blocked[i]);

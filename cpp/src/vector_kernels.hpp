@@ -109,8 +109,14 @@ struct RectangleShape {
     std::size_t num_obstacles;
 };
 
-/// A box among boxes, whose collisions are tested one by one.
-struct BoxShape {};
+/// A box among boxes of six limits each: the minima, then the maxima.
+struct BoxShape {
+    double half_size[3], bounding_radius;
+    const double* obstacles;
+    std::size_t num_obstacles;
+};
+/// Cross products of two edges that are shorter separate nothing (geometry_3d.hpp).
+inline constexpr double shortest_axis_squared = 1e-16;
 
 /// A body within a ball among boxes, to ask how far it is from them: of each the minima, then the
 /// maxima.
@@ -159,8 +165,7 @@ struct PolicyKernels {
     void (*clearances)(const RoundShape&, const double* states, std::size_t stride,
                        std::size_t count, double* out);
     /// The next actions of those in the bits `moving`, and where these lead. Returns, as bits,
-    /// those that can be in collision there; for a shape that is tested side by side, those that
-    /// are.
+    /// those that are in collision there.
     std::uint32_t (*act)(const Policy&, const Shape&, const Way&, std::uint32_t moving);
     /// Makes the next state of those in the bits `moving` their state, with its stage. Returns
     /// which of them have changed.
@@ -181,11 +186,13 @@ struct VectorKernels {
     /// out[i] = substream numbers[i] of parents[i].
     void (*substreams)(const Stream* parents, const std::uint32_t* numbers, std::size_t count,
                        Stream* out);
-    /// Which of the states, [count][2] or [count][3], are in collision: out[count].
+    /// Which of the states, [count][2], [count][3] or [count][6], are in collision: out[count].
     void (*discs_collide)(const DiscShape&, const double* states, std::size_t count,
                           std::uint8_t* out);
     void (*rectangles_collide)(const RectangleShape&, const double* states, std::size_t count,
                                std::uint8_t* out);
+    void (*boxes_collide)(const BoxShape&, const double* states, std::size_t count,
+                          std::uint8_t* out);
     PolicyKernels<PegPolicy2D, RectangleShape> peg_2d;
     PolicyKernels<PegPolicy3D, BoxShape> peg_3d;
     PolicyKernels<ViaPointPolicy, DiscShape> via_points;

@@ -1,6 +1,7 @@
 // Collision tests of many states side by side (one compilation per instruction set).
 //
-// Operation by operation those of `collides` in geometry_2d.cpp, so the answers are the same.
+// Operation by operation those of `collides` in geometry_2d.cpp and geometry_3d.cpp, so the answers
+// are the same.
 
 #pragma once
 
@@ -102,15 +103,102 @@ static void rectangles_collide(const RectangleShape& shape, const double* states
     }
 }
 
-/// Which of eight states can be in collision, as bits: those that are, where that is tested here.
+/// Whether an obstacle's limits, seen from the centres of eight boxes that reach `reach` along a
+/// direction, are beyond them.
+HOLDFAST_INLINE IntLanes separated(const Lanes (&direction)[3], const Lanes& reach,
+                                   const Lanes (&low)[3], const Lanes (&high)[3]) {
+    Lanes least = splat(0.0), greatest = splat(0.0);
+    for (std::size_t i = 0; i < 3; ++i) {
+        Lanes a, b;
+        least_and_greatest(direction[i] * low[i], direction[i] * high[i], a, b);
+        least += a;
+        greatest += b;
+    }
+    return (least >= reach) | (greatest <= -reach);
+}
+
+HOLDFAST_INLINE Lanes dot(const Lanes (&a)[3], const Lanes (&b)[3]) {
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+/// Whether a normal to an edge of each of eight boxes and to one of an obstacle separates them.
+HOLDFAST_INLINE IntLanes edges_separated(const BoxShape& shape, const Lanes (&axes)[3][3],
+                                         const Lanes (&low)[3], const Lanes (&high)[3]) {
+    const Lanes none = splat(0.0);
+    IntLanes apart = splat_int(0);
+    for (std::size_t k = 0; k < 3; ++k) {
+        const Lanes(&edge)[3] = axes[k];
+        const std::size_t next = (k + 1) % 3, last = (k + 2) % 3;
+        const Lanes directions[3][3] = {
+            {none, -edge[2], edge[1]}, {edge[2], none, -edge[0]}, {-edge[1], edge[0], none}};
+        for (const Lanes(&direction)[3] : directions) {
+            const Lanes reach = shape.half_size[next] * size_of(dot(direction, axes[next])) +
+                                shape.half_size[last] * size_of(dot(direction, axes[last]));
+            apart |= (dot(direction, direction) >= shortest_axis_squared) &
+                     separated(direction, reach, low, high);
+        }
+    }
+    return apart;
+}
+
+/// Which of eight boxes are in collision, as bits.
+static unsigned boxes_hit(const BoxShape& shape, const Lanes (&state)[6]) {
+    const auto yaw = sine_cosine_of(state[3]);
+    const auto pitch = sine_cosine_of(state[4]);
+    const auto roll = sine_cosine_of(state[5]);
+    const Lanes &sy = yaw.sine, &cy = yaw.cosine, &sp = pitch.sine, &cp = pitch.cosine;
+    const Lanes &sr = roll.sine, &cr = roll.cosine;
+    const Lanes axes[3][3] = {
+        {cy * cp, sy * cp, -sp},
+        {cy * sp * sr - sy * cr, sy * sp * sr + cy * cr, cp * sr},
+        {cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr},
+    };
+    Lanes reach[3];
+    for (std::size_t i = 0; i < 3; ++i) {
+        reach[i] = shape.half_size[0] * size_of(axes[0][i]) +
+                   shape.half_size[1] * size_of(axes[1][i]) +
+                   shape.half_size[2] * size_of(axes[2][i]);
+    }
+    unsigned hits = 0;
+    for (std::size_t o = 0; o < shape.num_obstacles && hits != 0xffu; ++o) {
+        const double* limits = shape.obstacles + 6 * o;
+        Lanes low[3], high[3];
+        IntLanes apart = splat_int(0);
+        for (std::size_t i = 0; i < 3; ++i) {
+            low[i] = limits[i] - state[i];
+            high[i] = limits[3 + i] - state[i];
+            apart |= (low[i] >= shape.bounding_radius) | (high[i] <= -shape.bounding_radius) |
+                     (low[i] >= reach[i]) | (high[i] <= -reach[i]);
+        }
+        if ((hits | bits_of(apart)) == 0xffu) continue;
+        for (std::size_t k = 0; k < 3; ++k) {
+            apart |= separated(axes[k], splat(shape.half_size[k]), low, high);
+        }
+        if ((hits | bits_of(apart)) == 0xffu) continue;
+        apart |= edges_separated(shape, axes, low, high);
+        hits |= ~bits_of(apart) & 0xffu;
+    }
+    return hits;
+}
+
+static void boxes_collide(const BoxShape& shape, const double* states, std::size_t count,
+                          std::uint8_t* out) {
+    for (std::size_t begin = 0; begin < count; begin += lane_count) {
+        Lanes state[6];
+        for (std::size_t c = 0; c < 6; ++c) state[c] = coordinate(states, count, begin, 6, c);
+        put(out + begin, count - begin, boxes_hit(shape, state));
+    }
+}
+
+/// Which of eight states are in collision, as bits.
 HOLDFAST_INLINE unsigned bits_hit(const DiscShape& shape, const Lanes (&state)[2]) {
     return bits_of(discs_hit(shape, state[0], state[1]));
 }
 HOLDFAST_INLINE unsigned bits_hit(const RectangleShape& shape, const Lanes (&state)[3]) {
     return rectangles_hit(shape, state[0], state[1], state[2]);
 }
-HOLDFAST_INLINE unsigned bits_hit(const BoxShape&, const Lanes (&)[6]) {
-    return 0xffu;
+HOLDFAST_INLINE unsigned bits_hit(const BoxShape& shape, const Lanes (&state)[6]) {
+    return boxes_hit(shape, state);
 }
 
 /// Less than the gaps between eight balls and the nearest box by more than rounding can make.

@@ -29,6 +29,7 @@ const VectorKernels table = {
     substreams,
     discs_collide,
     rectangles_collide,
+    boxes_collide,
     steps_of<PegPolicy2D, RectangleShape>,
     steps_of<PegPolicy3D, BoxShape>,
     steps_of<ViaPointPolicy, DiscShape>,

@@ -452,7 +452,9 @@ static void prior_block(const PriorGroup& group, std::size_t begin, std::size_t 
         }
         std::size_t chosen[prior_block_size], number = 0;
         for (std::size_t s = 0; s < num_singles; ++s) {
-            if (has_weight(singles[s])) chosen[number++] = singles[s];
+            // Without a branch, which would often be predicted wrongly.
+            chosen[number] = singles[s];
+            number += has_weight(singles[s]) ? 1 : 0;
         }
         for (std::size_t first = 0; first < number; first += sums_together) {
             const std::size_t here =

@@ -186,13 +186,11 @@ class _World(KeepsReadOnly):
         states = self._rows("states", states)
         if states.ndim != 2:
             raise InvalidValueError(f"states: shape {states.shape}, must be (n, {self.dimension})")
-        shape = (len(offsets), states.shape[0])
-        states_at = np.empty((*shape, self.dimension))
-        stages_at = np.empty(shape, dtype=np.int64)
-        followed = self._kernel.own.follow(
+        states_at = np.empty((len(offsets), *states.shape))
+        stages_at = np.empty(states_at.shape[:2], dtype=np.int64)
+        if not self._kernel.own.follow(
             policy, states, stage, offsets, tolerance, threads, states_at, stages_at
-        )
-        if not followed:
+        ):
             _raise_not_finite("states", states)
         return states_at, stages_at
 

@@ -26,7 +26,6 @@ from holdfast.problems.problem import Problem
 _STEP = ("policy", "limit_action", "move", "expected_move", "next_stage")
 """Functions that a step of the path calls."""
 
-
 _MOST_DRAWS = 1000
 """Bound on the draws of a move without noise: one that exceeds it waits for another number."""
 
@@ -56,8 +55,7 @@ def path_points(
     if (unfit := unfit_for_the_method(settings)) is not None:
         (section, key), reason = unfit
         raise InvalidValueError(f"{section}.{key} {reason}")
-    offsets = path_steps(settings)
-    threads = settings.active_sensing.num_cores
+    offsets, threads = path_steps(settings), settings.active_sensing.num_cores
     states_at, stages_at = _followed(problem, states, stage, offsets, threads)
     points = checked.policy(problem, states_at, stages_at)
     if settings.selector.actions == "executed":

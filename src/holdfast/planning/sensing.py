@@ -177,11 +177,10 @@ def choose_sensing_action(
     sets, factors, shown = predictions or predict(problem, settings, belief.states, stage)
     estimator = _estimator(problem, settings, belief, sets[0])
     sets = _on_a_line(problem, settings, sets)
-    points = sets.reshape(-1, sets.shape[-1])
     threads, size = sensing.num_cores, sensing.num_observation_samples
     hypothetical = _hypotheses_of(problem, belief, shown)(range(count), size, hypotheses)
     entropies, samples, likelihoods, visits = hypothetical.entropies(
-        estimators.scaled(points, estimator),
+        estimators.scaled(sets.reshape(-1, sets.shape[-1]), estimator),
         estimator,
         threads,
         factors,
@@ -314,9 +313,10 @@ def _on_a_line(problem: Problem, settings: PlanningSettings, sets: FloatArray) -
 def _estimator(
     problem: Problem, settings: PlanningSettings, belief: Belief, points: FloatArray
 ) -> estimators.KernelEstimator:
-    _require_bounded(problem, points, belief.states, "state")
-    dimension = points.shape[1]
     selector = settings.selector
+    if selector.method != "path_entropy":  # whose points have been checked
+        _require_bounded(problem, points, belief.states, "state")
+    dimension = points.shape[1]
     of_states = selector.method == "state_entropy"
     resolution = attributes.resolution_of(problem, selector.resolution, of_states=of_states)
     each_its_own = not isinstance(resolution, (int, float))

@@ -164,7 +164,7 @@ class CapsuleRobot(RigidBodyProblem):
 
     def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
         """Go toward the target of the stage, in proportion to the distance."""
-        return np.asarray(self._gains[stage] * (self._centers[stage] - states))
+        return np.asarray(_rows(self._gains, stage) * (_rows(self._centers, stage) - states))
 
     def next_stage(self, estimates: FloatArray, stage: int | IntArray) -> int | IntArray:
         """Advance where the estimate has reached the via point; the goal is the last stage."""
@@ -204,6 +204,11 @@ class CapsuleRobot(RigidBodyProblem):
             goal=self.model.goal.center,
             points=self._centers[:-1],
         )
+
+
+def _rows(of_stages: FloatArray, stage: int | IntArray) -> FloatArray:
+    # Of an array of stages, indexing takes ten times as long.
+    return of_stages[stage] if isinstance(stage, int) else of_stages.take(stage, axis=0)
 
 
 def _squared_distance(states: FloatArray, centers: FloatArray) -> FloatArray:
