@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "deterministic_math.hpp"
+#include "kept_memory.hpp"
 #include "point_sample.hpp"
 #include "point_tree.hpp"
 #include "prior_neighbors.hpp"
@@ -298,18 +299,18 @@ class Group {
   private:
     const Task& task_;
     std::size_t members_, leaves_of_piece_, leaves_;
-    std::vector<double> weights_, block_weights_, node_weights_;
-    std::vector<double> sampled_;  // of each member the weight in the sample; empty without one
-    std::vector<std::uint32_t> significant_, block_counts_, node_counts_, neighbors_;
-    std::vector<double> partial_;
-    std::vector<std::uint64_t> visited_;
+    KeptVector<double> weights_, block_weights_, node_weights_;
+    KeptVector<double> sampled_;  // of each member the weight in the sample; empty without one
+    KeptVector<std::uint32_t> significant_, block_counts_, node_counts_, neighbors_;
+    KeptVector<double> partial_;
+    KeptVector<std::uint64_t> visited_;
     PosteriorGroup view_{};
 };
 
 /// One posterior with many points, but few of all: a tree of its own.
 double own_tree_entropy(const Task& task, const double* weights, std::size_t survivors,
                         std::uint64_t& visits) {
-    std::vector<double> points, kept;
+    KeptVector<double> points, kept;
     points.reserve(survivors * task.dimension);
     kept.reserve(survivors);
     for (std::size_t n = 0; n < task.count; ++n) {
@@ -353,7 +354,7 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
     // more.
     const std::size_t batch =
         std::max<std::size_t>(max_group_lanes, (std::size_t{8} << 20) / count);
-    std::vector<double> weights(std::min(batch, posteriors) * count);
+    KeptVector<double> weights(std::min(batch, posteriors) * count);
     std::vector<std::size_t> survivors(std::min(batch, posteriors));
     std::vector<std::unique_ptr<PointTree>> trees(sets.number);
     // Sets whose groups are worked on at once: a group takes 400 bytes for each particle.

@@ -10,7 +10,8 @@
 
 #include <cstddef>
 #include <cstdint>
-#include <vector>
+
+#include "kept_memory.hpp"
 
 namespace holdfast {
 
@@ -53,16 +54,16 @@ class PointTree {
     std::size_t dimension;
     std::size_t leaves;
     /// Point in each slot; `no_point` in the slots that fill up the last leaf.
-    std::vector<std::uint32_t> order;
+    KeptVector<std::uint32_t> order;
     /// coordinates[(leaf * dimension + c) * leaf_size + slot]; +infinity in unused slots.
-    std::vector<double> coordinates;
-    std::vector<TreeNode> nodes;
+    KeptVector<double> coordinates;
+    KeptVector<TreeNode> nodes;
     /// low[node * dimension + c] <= coordinate c of every point of the node <= high[...].
-    std::vector<double> low, high;
+    KeptVector<double> low, high;
 
   private:
-    std::vector<double> keys_;
-    std::vector<std::uint32_t> rest_;
+    KeptVector<double> keys_;
+    KeptVector<std::uint32_t> rest_;
 
     std::uint32_t build(const double* points, std::uint32_t first_leaf, std::uint32_t last_leaf);
 };
