@@ -11,8 +11,6 @@ writes the table anew and says which rows changed. With ``--check`` it compares 
 nothing but holdfast: so a wheel is tried on the machine and with the compiler that it is for.
 """
 
-from __future__ import annotations
-
 import csv
 import platform
 import shlex

@@ -4,8 +4,6 @@ The reference is planning itself: a robot here folds its own state with the func
 ``holdfast.planning``, and every answer of the machine must be what these say of that state.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 from collections import deque
@@ -145,7 +143,7 @@ class Bench:
         assert call in self.ended
         return self.replies[call]
 
-    def assert_right(self, robot: Robot, request: Request) -> None:
+    def assert_right(self, robot: "Robot", request: Request) -> None:
         assert content(self.ask(request)) == robot.right_answer()
 
     def assert_refused(self, request: Request, code: str, *words: str) -> None:
@@ -153,7 +151,7 @@ class Bench:
         assert reply.code == code
         assert all(each in reply.text for each in words), reply.text
 
-    def known(self, *keys: int, owner: str | None = None) -> list[Robot]:
+    def known(self, *keys: int, owner: str | None = None) -> "list[Robot]":
         """Return robots that were served, and have sensed since."""
         robots = [Robot(key=key) for key in keys]
         for robot in robots:
