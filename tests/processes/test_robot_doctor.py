@@ -257,11 +257,10 @@ class TestTheWay:
     ) -> None:
         endpoint = f"{protocol}/127.0.0.1:{free_port()}"
         assert_fails(look(endpoint), "port", "refused", f"holdfast serve --listen {endpoint}{more}")
-        shutil.copy(test_other_code.EXAMPLE, site.directory)
-        seen = look(endpoint, site.configure(test_other_code.DOCUMENT))
-        assert (
-            f"--listen {endpoint} --problem {test_other_code.NAME}{more}" in seen["port"]["advice"]
-        )
+        name = f"room_over_{protocol}:LightDarkRoom"
+        shutil.copy(test_other_code.EXAMPLE, site.directory / f"room_over_{protocol}.py")
+        seen = look(endpoint, site.configure({**test_other_code.DOCUMENT, "problem": name}))
+        assert f"--listen {endpoint} --problem {name}{more}" in seen["port"]["advice"]
 
     def test_a_port_that_does_not_answer(self, look: Look) -> None:
         with contextlib.ExitStack() as stack:
