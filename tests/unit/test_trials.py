@@ -121,7 +121,7 @@ class TestManyTrials:
             ('ProblemError("too heavy")', r"trial [01] \(seed 3\): too heavy"),
             (
                 "ZeroDivisionError",
-                r"(?s)trial [01] .* raised ZeroDivisionError\n  File ",
+                r"(?s)trial [01] \(seed 3\): failing_.* raised ZeroDivisionError\n  File ",
             ),
         ],
     )

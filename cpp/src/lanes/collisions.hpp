@@ -53,15 +53,6 @@ HOLDFAST_INLINE IntLanes discs_hit(const DiscShape& shape, const Lanes& x, const
     return hits;
 }
 
-static void discs_collide(const DiscShape& shape, const double* states, std::size_t count,
-                          std::uint8_t* out) {
-    for (std::size_t begin = 0; begin < count; begin += lane_count) {
-        const Lanes x = coordinate(states, count, begin, 2, 0);
-        const Lanes y = coordinate(states, count, begin, 2, 1);
-        put(out + begin, count - begin, bits_of(discs_hit(shape, x, y)));
-    }
-}
-
 /// Which of eight rectangles are in collision, as bits.
 HOLDFAST_INLINE unsigned rectangles_hit(const RectangleShape& shape, const Lanes& x, const Lanes& y,
                                         const Lanes& angle) {
@@ -91,16 +82,6 @@ HOLDFAST_INLINE unsigned rectangles_hit(const RectangleShape& shape, const Lanes
         hits |= ~bits_of(apart) & 0xffu;
     }
     return hits;
-}
-
-static void rectangles_collide(const RectangleShape& shape, const double* states, std::size_t count,
-                               std::uint8_t* out) {
-    for (std::size_t begin = 0; begin < count; begin += lane_count) {
-        const Lanes x = coordinate(states, count, begin, 3, 0);
-        const Lanes y = coordinate(states, count, begin, 3, 1);
-        const Lanes angle = coordinate(states, count, begin, 3, 2);
-        put(out + begin, count - begin, rectangles_hit(shape, x, y, angle));
-    }
 }
 
 /// Whether an obstacle's limits, seen from the centres of eight boxes that reach `reach` along a
@@ -181,15 +162,6 @@ static unsigned boxes_hit(const BoxShape& shape, const Lanes (&state)[6]) {
     return hits;
 }
 
-static void boxes_collide(const BoxShape& shape, const double* states, std::size_t count,
-                          std::uint8_t* out) {
-    for (std::size_t begin = 0; begin < count; begin += lane_count) {
-        Lanes state[6];
-        for (std::size_t c = 0; c < 6; ++c) state[c] = coordinate(states, count, begin, 6, c);
-        put(out + begin, count - begin, boxes_hit(shape, state));
-    }
-}
-
 /// Which of eight states are in collision, as bits.
 HOLDFAST_INLINE unsigned bits_hit(const DiscShape& shape, const Lanes (&state)[2]) {
     return bits_of(discs_hit(shape, state[0], state[1]));
@@ -199,6 +171,17 @@ HOLDFAST_INLINE unsigned bits_hit(const RectangleShape& shape, const Lanes (&sta
 }
 HOLDFAST_INLINE unsigned bits_hit(const BoxShape& shape, const Lanes (&state)[6]) {
     return boxes_hit(shape, state);
+}
+
+/// Which of the states, [count][d], are in collision: out[count].
+template <class Shape, std::size_t d>
+static void states_collide(const Shape& shape, const double* states, std::size_t count,
+                           std::uint8_t* out) {
+    for (std::size_t begin = 0; begin < count; begin += lane_count) {
+        Lanes state[d];
+        for (std::size_t c = 0; c < d; ++c) state[c] = coordinate(states, count, begin, d, c);
+        put(out + begin, count - begin, bits_hit(shape, state));
+    }
 }
 
 /// Less than the gaps between eight balls and the nearest box by more than rounding can make.
