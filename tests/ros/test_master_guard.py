@@ -1,7 +1,6 @@
 """A ROS 1 master that dies, and nodes of others that do not notice: real masters, stock nodes."""
 
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -158,11 +157,11 @@ class TestItsOwnMaster:
         guard = graph.guard("--no-rosout")
         graph.run("rosparam", "set", "/speed", "1")
         journal = graph.directory / "run" / "ros1_master_guard" / f"master-{graph.port}.journal"
-        wait_for(journal.exists)
+        wait_for(lambda: journal.exists() and b"speed" in journal.read_bytes())  # no write is left
         if loss == "file":
             journal.unlink()
         else:
-            shutil.rmtree(journal.parent)
+            journal.parent.rename(graph.directory / "taken")
         replaced(graph, graph.kill_master())
         assert graph.registered()["parameters"]["speed"] == 1
         wait_for(journal.exists)
@@ -334,10 +333,10 @@ class TestAMasterOfOthers:
     def test_what_cannot_be_written_down_is_known_to_the_next_one(self, graph: Graph) -> None:
         graph.start("rosmaster", "--core", "-p", str(graph.port))
         wait_for(graph.master_pid)
-        guard = graph.guard("--no-rosout")
-        directory = graph.directory / "run" / "ros1_master_guard"
-        shutil.rmtree(directory)
-        directory.touch()
+        (directory := graph.directory / "kept").symlink_to("run")
+        guard = graph.guard("--no-rosout", "--directory", str(directory))
+        (unusable := graph.directory / "unusable").symlink_to(__file__)
+        unusable.replace(directory)  # at once, whatever the guard is writing
         graph.run("rosparam", "set", "/speed", "1")
         wait_for(lambda: graph.events(guard, "journal_failed"))
         time.sleep(1.0)
