@@ -204,6 +204,8 @@ class Ros2Environment:
 
     def _call(self, call: RobotCall, request: Any) -> Any:
         """Return the answer to a request, or the result of a goal, if it says that it succeeded."""
+        if self._cancelled:
+            raise EnvironmentFailedError(f"{call} was not called: {self._cancelled}")
         limits = (
             Deadline(self._timeout_s, f"{_PART:g} times environment.timeout_ms"),
             Deadline(self._discovery_timeout_s, _DISCOVERY),
@@ -245,8 +247,6 @@ class Ros2Environment:
         what: str,
     ) -> Any:
         """Return the answer to a request; ``absence`` bounds the time without a server."""
-        if self._cancelled:
-            raise EnvironmentFailedError(f"{call} was not called: {self._cancelled}")
         futures: list[Any] = []
 
         def answered() -> bool:
