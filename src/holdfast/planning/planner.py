@@ -40,8 +40,7 @@ from holdfast.planning import interruption, sensing
 from holdfast.planning.belief import (
     Belief,
     ObservationInfo,
-    distinct_particles,
-    effective_sample_size,
+    belief_sizes,
     estimate,
     regularised,
     resample,
@@ -253,8 +252,7 @@ class Planner:
         self._require_size(state)
         chosen = sensing_action_of(problem, sensing_action, optional=observation is None)
         if observation is None:
-            size = effective_sample_size(state.belief)
-            distinct = distinct_particles(state.belief.states)
+            size, distinct = belief_sizes(state.belief)
             info = ObservationInfo(size, True, False, distinct_particles=distinct)
             return state._replace(sensed=True), info
         ranks = None
