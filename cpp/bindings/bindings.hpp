@@ -32,8 +32,8 @@ using Input = nanobind::ndarray<const double, nanobind::ndim<rank>, nanobind::c_
 
 /// An array of the caller, for results: NumPy makes a small array faster than nanobind does.
 template <class Value, std::size_t rank>
-using InPlace = nanobind::ndarray<Value, nanobind::ndim<rank>, nanobind::c_contig,
-                                  nanobind::device::cpu>;
+using InPlace =
+    nanobind::ndarray<Value, nanobind::ndim<rank>, nanobind::c_contig, nanobind::device::cpu>;
 
 inline void require(bool condition, const char* message) {
     if (!condition) throw std::invalid_argument(message);

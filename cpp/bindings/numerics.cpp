@@ -1,6 +1,7 @@
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <limits>
 #include <vector>
 
@@ -32,10 +33,8 @@ using AnyArray = nb::ndarray<const Value, nb::c_contig, nb::device::cpu>;
 
 /// False for a NaN.
 template <class Value>
-bool all_within(const AnyArray<Value>& in, Value least, Value most) {
+bool are_within(const Value* values, std::size_t size, Value least, Value most) {
     // In an integer as wide as a value, the compiler compares several values at a time.
-    const Value* values = in.data();
-    const std::size_t size = in.size();
     std::int64_t within = 1;
     for (std::size_t i = 0; i < size; ++i) {
         within &= static_cast<std::int64_t>(least <= values[i]) &
@@ -44,8 +43,15 @@ bool all_within(const AnyArray<Value>& in, Value least, Value most) {
     return within != 0;
 }
 
+template <class Value>
+bool all_within(const AnyArray<Value>& in, Value least, Value most) {
+    return are_within(in.data(), in.size(), least, most);
+}
+
+constexpr double smallest = std::numeric_limits<double>::denorm_min();
+constexpr double largest = std::numeric_limits<double>::max();
+
 bool all_finite(const AnyArray<double>& in) {
-    constexpr double largest = std::numeric_limits<double>::max();
     return all_within(in, -largest, largest);
 }
 
@@ -64,17 +70,22 @@ nb::tuple reweighed(Particles particles, double* values, Further... further) {
     return nb::make_tuple(survivors, sizes.effective, sizes.distinct, further...);
 }
 
-nb::tuple update_by_gaussian(const Input<2>& states, const Input<1>& weights,
-                             const Input<1>& observed, const Input<2>& mean,
-                             const AnyArray<double>& variance,
-                             const std::vector<std::size_t>& circular,
-                             InPlace<double, 1> posterior) {
+/// None if a mean is not finite, or a variance not positive and finite.
+nb::object update_by_gaussian(const Input<2>& states, const Input<1>& weights,
+                              const Input<1>& observed, const Input<2>& mean,
+                              const AnyArray<double>& variance,
+                              const std::vector<std::size_t>& circular,
+                              InPlace<double, 1> posterior) {
     const Particles particles = particles_of(states, weights);
     const std::size_t count = particles.count, size = observed.shape(0);
     const bool varies = variance.ndim() > 1;
     require(mean.shape(0) == count && mean.shape(1) == size && posterior.shape(0) == count &&
                 variance.size() == (varies ? count * size : size),
             "shapes differ");
+    if (!are_within(mean.data(), mean.size(), -largest, largest) ||
+        !are_within(variance.data(), variance.size(), smallest, largest)) {
+        return nb::none();
+    }
     const double nearest = gaussian_log_likelihood(
         particles, {size, observed.data(), mean.data(), variance.data(), varies, circular},
         posterior.data());
@@ -126,9 +137,9 @@ void holdfast::bind_numerics(nb::module_& module) {
             return reweighed(particles_of(states, weights), log_likelihood.data());
         },
         nb::arg("states"), nb::arg("weights"), nb::arg("log_likelihood").noconvert());
-    define(module, "update_by_gaussian", &update_by_gaussian, nb::arg("states"),
-           nb::arg("weights"), nb::arg("observed"), nb::arg("mean"), nb::arg("variance"),
-           nb::arg("circular"), nb::arg("posterior").noconvert());
+    define(module, "update_by_gaussian", &update_by_gaussian, nb::arg("states"), nb::arg("weights"),
+           nb::arg("observed"), nb::arg("mean"), nb::arg("variance"), nb::arg("circular"),
+           nb::arg("posterior").noconvert());
     define(module, "philox", [](const StreamWords& words, std::uint32_t block) {
         const PhiloxBlock result = philox(to_stream(words), block);
         return StreamWords{result.words[0], result.words[1], result.words[2], result.words[3], 0};
@@ -161,11 +172,15 @@ void holdfast::bind_numerics(nb::module_& module) {
     define(
         module, "resample",
         [](const Input<2>& states, const Input<1>& weights, const StreamWords& words,
-           InPlace<double, 2> drawn) {
+           InPlace<double, 2> drawn, InPlace<double, 1> drawn_weights) {
             const Particles particles = particles_of(states, weights);
-            require(drawn.shape(0) == particles.count && drawn.shape(1) == particles.dimension,
+            const std::size_t count = particles.count;
+            require(drawn.shape(0) == count && drawn.shape(1) == particles.dimension &&
+                        drawn_weights.shape(0) == count,
                     "shapes differ");
             resample(particles, uniform(to_stream(words), 0), drawn.data());
+            std::fill_n(drawn_weights.data(), count, 1.0 / static_cast<double>(count));
         },
-        nb::arg("states"), nb::arg("weights"), nb::arg("words"), nb::arg("drawn").noconvert());
+        nb::arg("states"), nb::arg("weights"), nb::arg("words"), nb::arg("drawn").noconvert(),
+        nb::arg("drawn_weights").noconvert());
 }

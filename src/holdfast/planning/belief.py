@@ -114,8 +114,7 @@ def _restored(states: FloatArray, weights: FloatArray) -> Belief:
 
 def uniform_weights(count: int) -> FloatArray:
     """Return ``count`` weights of ``1 / count``."""
-    weights = np.empty(count)
-    weights.fill(1.0 / count)
+    weights = np.full(count, 1.0 / count)
     weights.setflags(write=False)
     return weights
 
@@ -228,8 +227,8 @@ def update(
         within_gate = possible = _is_possible(belief, log_likelihood)
         if possible and rank_stream is not None:
             within_gate = _is_typical(problem, belief, sensing_action, log_likelihood, rank_stream)
-        found = _kernel.update(*belief, log_likelihood)
-        return _updated(belief, log_likelihood, *found, possible, None, within_gate)
+        sizes = _kernel.update(*belief, log_likelihood)
+        return _updated(belief, log_likelihood, sizes, possible, None, within_gate)
     mean, variance = checked.prediction(problem, belief.states, sensing_action)
     size = mean.shape[-1]
     if size != observed.shape[0]:
@@ -237,18 +236,18 @@ def update(
             f"observation of {observed.shape[0]} coordinates: sensing action {sensing_action} "
             f"gives {size}"
         )
-    checked.require_usable(problem, sensing_action, mean, variance)
     angles = circular_observation(problem, sensing_action, size)
     posterior = np.empty(belief.weights.shape)
-    *sizes, squared = _kernel.update_by_gaussian(
-        *belief, observed, mean, variance, angles, posterior
-    )
+    found = _kernel.update_by_gaussian(*belief, observed, mean, variance, angles, posterior)
+    if found is None:
+        raise checked.unusable(problem, sensing_action, mean, variance)
+    squared = found[3]
     explained = squared <= VALIDATION_GATE_SQUARED
     # Most observations are near a particle, and cost no more than this comparison.
     within_gate = squared <= gate(size) or is_within(
         observed, mean, variance, belief.weights, angles
     )
-    return _updated(belief, posterior, *sizes, explained, math.sqrt(squared), within_gate)
+    return _updated(belief, posterior, found[:3], explained, math.sqrt(squared), within_gate)
 
 
 def _is_possible(belief: Belief, log_likelihood: FloatArray) -> bool:
@@ -289,8 +288,8 @@ def update_by_move(
     observed = finite(observation)
     log_likelihood = checked.move_log_likelihood(problem, belief.states, task_action, observed)
     possible = _is_possible(belief, log_likelihood)
-    found = _kernel.update(*belief, log_likelihood)
-    return _updated(belief, log_likelihood, *found, possible, None, possible)
+    sizes = _kernel.update(*belief, log_likelihood)
+    return _updated(belief, log_likelihood, sizes, possible, None, possible)
 
 
 def finite(observation: npt.ArrayLike) -> FloatArray:
@@ -306,15 +305,14 @@ def finite(observation: npt.ArrayLike) -> FloatArray:
 def _updated(
     belief: Belief,
     posterior: FloatArray,
-    survivors: int,
-    effective_size: float,
-    distinct: int,
+    sizes: tuple[int, float, int],
     explained: bool,
     distance: float | None,
     within_gate: bool,
 ) -> tuple[Belief, ObservationInfo]:
+    survivors, effective, distinct = sizes
     explained = explained and survivors > 0
-    info = ObservationInfo(effective_size, explained, False, distance, within_gate, distinct)
+    info = ObservationInfo(effective, explained, False, distance, within_gate, distinct)
     return reweighted(belief, posterior, survivors), info
 
 
@@ -333,10 +331,9 @@ def resample(belief: Belief, stream: Stream) -> Belief:
     times: Carpenter, Clifford and Fearnhead (1999), "Improved particle filter for nonlinear
     problems".
     """
-    states = np.empty(belief.states.shape)
-    _kernel.resample(*belief, stream.words, states)
-    states.setflags(write=False)
-    return Belief(states, uniform_weights(states.shape[0]))
+    states, weights = np.empty(belief.states.shape), np.empty(belief.weights.shape)
+    _kernel.resample(*belief, stream.words, states, weights)
+    return _restored(states, weights)
 
 
 def regularised(

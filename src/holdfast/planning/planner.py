@@ -63,6 +63,8 @@ from holdfast.problems.problem import Problem
 
 CHECKPOINT_VERSION = 1
 
+_LITTLE_ENDIAN = np.dtype("<f8")
+
 
 class PlanningState(NamedTuple):
     """Everything that the next decision depends on, besides the problem and the settings.
@@ -260,7 +262,7 @@ class Planner:
             ranks = stream(state.seed, state.trial, state.step, Purpose.RANK_TEST)
         updated = update(problem, state.belief, chosen, observation, ranks)
         belief, info = self._resampled(state, *updated, Purpose.RESAMPLING)
-        return state._replace(sensed=True, belief=belief), info
+        return PlanningState(*state[:4], True, belief), info
 
     @in_own_mode
     def observe_move(
@@ -291,14 +293,13 @@ class Planner:
         count = belief.weights.shape[0]
         threshold = self.settings.particle_filter.resampling_threshold * count
         # Rounding may leave the size of equal weights a little above their number.
-        resampled = threshold == count or found.effective_sample_size <= threshold
-        if resampled:
-            own = stream(state.seed, state.trial, state.step, purpose)
-            drawn = resample(belief, own)
-            if static := static_parameters(self.problem):
-                drawn = regularised(drawn, belief, static, circular_states(self.problem), own)
-            belief = drawn
-        return belief, found._replace(resampled=resampled)
+        if threshold != count and found.effective_sample_size > threshold:
+            return belief, found
+        own = stream(state.seed, state.trial, state.step, purpose)
+        drawn = resample(belief, own)
+        if static := static_parameters(self.problem):
+            drawn = regularised(drawn, belief, static, circular_states(self.problem), own)
+        return drawn, found._replace(resampled=True)
 
     @in_own_mode
     def reinitialise(self, state: PlanningState) -> PlanningState:
@@ -476,19 +477,10 @@ def digest(state: PlanningState) -> bytes:
     BLAKE2b over all fields; the belief's arrays as little-endian float64 in C order.
     """
     states, weights = state.belief
-    header = struct.pack(
-        "<QQQQ?QQ",
-        state.seed,
-        state.trial,
-        state.step,
-        state.stage,
-        state.sensed,
-        states.shape[0],
-        states.shape[1],
-    )
+    header = struct.pack("<QQQQ?QQ", *state[:5], *states.shape)
     hashed = hashlib.blake2b(header, digest_size=32, person=b"holdfast-state")
-    hashed.update(np.ascontiguousarray(states, dtype="<f8").data)
-    hashed.update(np.ascontiguousarray(weights, dtype="<f8").data)
+    for array in (states, weights):
+        hashed.update(np.asarray(array, _LITTLE_ENDIAN, order="C").data)
     return hashed.digest()
 
 

@@ -62,16 +62,16 @@ def observe_together(
         chosen = attributes.sensing_action_of(problem, action)
         beliefs = [states[row].belief for row in rows]
         mean, variance = checked.prediction(problem, _stacked(beliefs), chosen)
-        checked.require_usable(problem, chosen, mean, variance)
         variances = variance if variance.ndim > 1 else itertools.repeat(variance)
         angles = attributes.circular_observation(problem, chosen, mean.shape[-1])
         for row, belief, shown, spread in zip(rows, beliefs, mean, variances, strict=False):
             observed, posterior = finite(observations[row]), np.empty(count)
             if observed.shape[0] != shown.shape[1]:
                 raise InvalidValueError(f"observations that sensing action {action} does not give")
-            survivors, size, *_ = _kernel.update_by_gaussian(
-                *belief, observed, shown, spread, angles, posterior
-            )
+            found = _kernel.update_by_gaussian(*belief, observed, shown, spread, angles, posterior)
+            if found is None:
+                raise checked.unusable(problem, chosen, mean, variance)
+            survivors, size = found[:2]
             state, belief = states[row], reweighted(belief, posterior, survivors)
             if threshold == count or size <= threshold:
                 name = state.seed, state.trial, state.step, Purpose.RESAMPLING
