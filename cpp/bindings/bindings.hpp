@@ -10,6 +10,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <initializer_list>
+#include <stdexcept>
 #include <thread>
 
 #include "philox.hpp"
@@ -28,6 +29,15 @@ namespace holdfast::bindings {
 template <std::size_t rank>
 using Input = nanobind::ndarray<const double, nanobind::ndim<rank>, nanobind::c_contig,
                                 nanobind::device::cpu>;
+
+/// An array of the caller, for results: NumPy makes a small array faster than nanobind does.
+template <class Value, std::size_t rank>
+using InPlace =
+    nanobind::ndarray<Value, nanobind::ndim<rank>, nanobind::c_contig, nanobind::device::cpu>;
+
+inline void require(bool condition, const char* message) {
+    if (!condition) throw std::invalid_argument(message);
+}
 
 template <class Value>
 using Output = nanobind::ndarray<nanobind::numpy, Value>;

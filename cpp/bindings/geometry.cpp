@@ -31,14 +31,6 @@ using namespace holdfast::bindings;
 
 namespace {
 
-// Results are written to arrays of the caller: NumPy makes a small array faster than nanobind does.
-template <class Value, std::size_t rank>
-using InPlace = nb::ndarray<Value, nb::ndim<rank>, nb::c_contig, nb::device::cpu>;
-
-void require(bool condition, const char* message) {
-    if (!condition) throw std::invalid_argument(message);
-}
-
 bool all_finite(const double* values, std::size_t count) {
     bool finite = true;
     for (std::size_t i = 0; i < count; ++i) finite &= std::isfinite(values[i]);

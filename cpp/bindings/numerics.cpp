@@ -1,7 +1,11 @@
 #include <nanobind/stl/array.h>
+#include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <limits>
+#include <vector>
 
+#include "belief_update.hpp"
 #include "bindings.hpp"
 #include "deterministic_math.hpp"
 #include "resampling.hpp"
@@ -29,10 +33,8 @@ using AnyArray = nb::ndarray<const Value, nb::c_contig, nb::device::cpu>;
 
 /// False for a NaN.
 template <class Value>
-bool all_within(const AnyArray<Value>& in, Value least, Value most) {
+bool are_within(const Value* values, std::size_t size, Value least, Value most) {
     // In an integer as wide as a value, the compiler compares several values at a time.
-    const Value* values = in.data();
-    const std::size_t size = in.size();
     std::int64_t within = 1;
     for (std::size_t i = 0; i < size; ++i) {
         within &= static_cast<std::int64_t>(least <= values[i]) &
@@ -41,9 +43,53 @@ bool all_within(const AnyArray<Value>& in, Value least, Value most) {
     return within != 0;
 }
 
+template <class Value>
+bool all_within(const AnyArray<Value>& in, Value least, Value most) {
+    return are_within(in.data(), in.size(), least, most);
+}
+
+constexpr double smallest = std::numeric_limits<double>::denorm_min();
+constexpr double largest = std::numeric_limits<double>::max();
+
 bool all_finite(const AnyArray<double>& in) {
-    constexpr double largest = std::numeric_limits<double>::max();
     return all_within(in, -largest, largest);
+}
+
+Particles particles_of(const Input<2>& states, const Input<1>& weights) {
+    require(states.shape(0) == weights.shape(0) && weights.shape(0) > 0, "shapes differ");
+    return {states.shape(0), states.shape(1), states.data(), weights.data()};
+}
+
+/// Makes log-likelihoods posterior weights. Returns how many are not zero, and the sizes of the
+/// belief that has them, or of the one before if none is.
+template <class... Further>
+nb::tuple reweighed(Particles particles, double* values, Further... further) {
+    const std::size_t survivors = reweigh(particles, values);
+    if (survivors > 0) particles.weights = values;
+    const BeliefSizes sizes = sizes_of(particles);
+    return nb::make_tuple(survivors, sizes.effective, sizes.distinct, further...);
+}
+
+/// None if a mean is not finite, or a variance not positive and finite.
+nb::object update_by_gaussian(const Input<2>& states, const Input<1>& weights,
+                              const Input<1>& observed, const Input<2>& mean,
+                              const AnyArray<double>& variance,
+                              const std::vector<std::size_t>& circular,
+                              InPlace<double, 1> posterior) {
+    const Particles particles = particles_of(states, weights);
+    const std::size_t count = particles.count, size = observed.shape(0);
+    const bool varies = variance.ndim() > 1;
+    require(mean.shape(0) == count && mean.shape(1) == size && posterior.shape(0) == count &&
+                variance.size() == (varies ? count * size : size),
+            "shapes differ");
+    if (!are_within(mean.data(), mean.size(), -largest, largest) ||
+        !are_within(variance.data(), variance.size(), smallest, largest)) {
+        return nb::none();
+    }
+    const double nearest = gaussian_log_likelihood(
+        particles, {size, observed.data(), mean.data(), variance.data(), varies, circular},
+        posterior.data());
+    return reweighed(particles, posterior.data(), nearest);
 }
 
 }  // namespace
@@ -80,6 +126,20 @@ void holdfast::bind_numerics(nb::module_& module) {
             log_weights.data(), log_weights.shape(0), drop_negligible, out);
         return nb::make_tuple(result, survivors);
     });
+    define(module, "belief_sizes", [](const Input<2>& states, const Input<1>& weights) {
+        const BeliefSizes sizes = sizes_of(particles_of(states, weights));
+        return nb::make_tuple(sizes.effective, sizes.distinct);
+    });
+    define(
+        module, "update",
+        [](const Input<2>& states, const Input<1>& weights, InPlace<double, 1> log_likelihood) {
+            require(log_likelihood.shape(0) == weights.shape(0), "shapes differ");
+            return reweighed(particles_of(states, weights), log_likelihood.data());
+        },
+        nb::arg("states"), nb::arg("weights"), nb::arg("log_likelihood").noconvert());
+    define(module, "update_by_gaussian", &update_by_gaussian, nb::arg("states"), nb::arg("weights"),
+           nb::arg("observed"), nb::arg("mean"), nb::arg("variance"), nb::arg("circular"),
+           nb::arg("posterior").noconvert());
     define(module, "philox", [](const StreamWords& words, std::uint32_t block) {
         const PhiloxBlock result = philox(to_stream(words), block);
         return StreamWords{result.words[0], result.words[1], result.words[2], result.words[3], 0};
@@ -109,4 +169,18 @@ void holdfast::bind_numerics(nb::module_& module) {
         systematic_resample(weights.data(), weights.shape(0), offset, out);
         return result;
     });
+    define(
+        module, "resample",
+        [](const Input<2>& states, const Input<1>& weights, const StreamWords& words,
+           InPlace<double, 2> drawn, InPlace<double, 1> drawn_weights) {
+            const Particles particles = particles_of(states, weights);
+            const std::size_t count = particles.count;
+            require(drawn.shape(0) == count && drawn.shape(1) == particles.dimension &&
+                        drawn_weights.shape(0) == count,
+                    "shapes differ");
+            resample(particles, uniform(to_stream(words), 0), drawn.data());
+            std::fill_n(drawn_weights.data(), count, 1.0 / static_cast<double>(count));
+        },
+        nb::arg("states"), nb::arg("weights"), nb::arg("words"), nb::arg("drawn").noconvert(),
+        nb::arg("drawn_weights").noconvert());
 }

@@ -1,5 +1,9 @@
 #include "resampling.hpp"
 
+#include <algorithm>
+
+#include "kept_memory.hpp"
+
 namespace holdfast {
 
 void systematic_resample(const double* weights, std::size_t count, double offset,
@@ -15,6 +19,15 @@ void systematic_resample(const double* weights, std::size_t count, double offset
             cumulated += weights[n++];
         }
         indices[j] = static_cast<std::int64_t>(n < count ? n : last_with_weight);
+    }
+}
+
+void resample(const Particles& particles, double offset, double* drawn) {
+    const auto& [count, dimension, states, weights] = particles;
+    KeptVector<std::int64_t> indices(count);
+    systematic_resample(weights, count, offset, indices.data());
+    for (const std::int64_t index : indices) {
+        drawn = std::copy_n(states + static_cast<std::size_t>(index) * dimension, dimension, drawn);
     }
 }
 

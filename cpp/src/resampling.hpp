@@ -10,11 +10,16 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "belief_update.hpp"
+
 namespace holdfast {
 
 /// indices[j] = the particle under tooth (j + offset) / count; offset in [0, 1); the
 /// weights need not sum to 1.
 void systematic_resample(const double* weights, std::size_t count, double offset,
                          std::int64_t* indices);
+
+/// The states of the particles under the teeth, [count][dimension].
+void resample(const Particles& particles, double offset, double* drawn);
 
 }  // namespace holdfast

@@ -11,7 +11,7 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.randomness import Purpose, stream
 from holdfast.planning.belief import (
     Belief,
-    effective_sample_size,
+    belief_sizes,
     estimate,
     regularised,
     resample,
@@ -114,12 +114,11 @@ class TestSummaries:
         np.testing.assert_allclose(estimate(belief), mean, atol=1e-15)
         np.testing.assert_allclose(standard_deviation(belief), np.sqrt(variance), rtol=1e-14)
 
-    def test_effective_sample_size(self) -> None:
-        assert effective_sample_size(Belief.uniform(np.zeros((8, 1)))) == 8.0
-        one = Belief.weighted(np.zeros((3, 1)), [0.0, 1.0, 0.0])
-        assert effective_sample_size(one) == 1.0
-        two = Belief.weighted(np.zeros((4, 1)), [0.0, 1.0, 1.0, 0.0])
-        assert effective_sample_size(two) == 2.0
+    def test_sizes(self) -> None:
+        assert belief_sizes(Belief.uniform(np.zeros((8, 1)))) == (8.0, 1)
+        one = Belief.weighted([[0.0], [-0.0], [1.0], [0.0]], [0.0, 1.0, 0.0, 0.0])
+        assert belief_sizes(one) == (1.0, 3)
+        assert belief_sizes(Belief.weighted(one.states, [0.0, 1.0, 1.0, 0.0])) == (2.0, 3)
 
 
 class TestUpdate:

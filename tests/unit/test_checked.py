@@ -101,11 +101,7 @@ def huge(value: float) -> np.ndarray:
         ("next_stage", lambda *_: float("nan"), "next_stage of .* is nan: allowed are 0 to 0"),
         ("reward", lambda *_: object(), "reward of .* returned object .*: need one number"),
         ("is_goal", lambda *_: huge(1.0), r"is_goal of .* shape \(4000,\): need one number"),
-        (
-            "policy",
-            lambda states, _: np.full((*states.shape[:-1], 1), np.nan),
-            r"returned \[nan nan\] in|policy of line .*\[nan",
-        ),
+        ("policy", lambda s, _: np.full((*s.shape[:-1], 1), np.nan), r"of line .*\[nan"),
         ("observation_mean", lambda s, _: np.full((*s.shape[:-1], 900), np.nan), r"is nan at \(0"),
         ("observation_variance", lambda *_: -np.ones(1), r"is -1\.0 at \(0,\) of shape \(1,\)"),
         ("sample_observation", lambda *_: "no", r"returned str \('no'\): need a float64 array"),
@@ -193,13 +189,7 @@ class TestStreams:
         assert moves[0::2] == moves[1::2]
 
     @pytest.mark.parametrize(
-        "derive",
-        [
-            lambda stream: stream,
-            lambda stream: stream.substream(1),
-            lambda stream: stream.anew(),
-            copy.copy,
-        ],
+        "derive", [lambda own: own, lambda own: own.substream(1), Stream.anew, copy.copy]
     )
     def test_one_that_is_kept_is_refused(self, derive: Callable[[Stream], Stream]) -> None:
         class Keeping(Line):

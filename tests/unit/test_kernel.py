@@ -15,11 +15,19 @@ from tests.programs import completed
 
 from holdfast import _kernel
 from holdfast.numerics.arrays import FloatArray, IntArray
+from holdfast.numerics.reproducible import log, wrapped
+from holdfast.planning.belief import uniform_weights
 from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
-ALL_ONES = 0xFFFFFFFF
 WORDS = (7, 0, 3, 2, 1)
+
+# Counter, key and block, in hexadecimal.
+KNOWN_ANSWERS = [
+    "0 0 0 0 0 0 6627e8d5 e169c58d bc57ac4c 9b00dbd8",
+    f"{'ffffffff ' * 6}408f276d 41c83b0e a20bc7c6 6d5451fd",
+    "243f6a88 85a308d3 13198a2e 03707344 a4093822 299f31d0 d16cfe09 94fdcceb 5001e420 24126ea1",
+]
 
 # A bit of everything that has several compilations, in sizes that leave every remainder modulo 8,
 # and the functions that have one. Prints a hash for each, by name.
@@ -71,6 +79,11 @@ for n in (1, 7, 8, 9, 31, 1000):
     note(f"normalize {n}", kernel.normalize(values * 20.0, False)[0])
     weights = kernel.normalize(values, False)[0]
     note(f"resampling {n}", kernel.systematic_resample(weights, 0.37))
+    for variance in (rows[0]**2, rows**2):
+        numbers = kernel.update_by_gaussian(rows, weights, rows[0], rows, variance, (1, 3), values)
+        note(f"update {n} {variance.shape}", numbers, values)
+    kernel.resample(rows, weights, words, drawn := np.empty((n, 5)), values)
+    note(f"drawn {n}", drawn, values)
 
 # Every way to an entropy, with its index in the kernel's own count: pair by pair, with a tree of
 # its own, and grouped in one to four vectors and in more than one group.
@@ -257,27 +270,10 @@ class TestFloatingPointMode:
 class TestPhilox:
     """The known answers that the generator's authors publish with their code."""
 
-    @pytest.mark.parametrize(
-        ("counter", "key", "expected"),
-        [
-            ((0,) * 4, (0,) * 2, (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
-            ((ALL_ONES,) * 4, (ALL_ONES,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
-            (
-                (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
-                (0xA4093822, 0x299F31D0),
-                (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
-            ),
-        ],
-    )
-    def test_known_answers(
-        self,
-        counter: tuple[int, int, int, int],
-        key: tuple[int, int],
-        expected: tuple[int, int, int, int],
-    ) -> None:
-        block, *above = counter
-        words = (*key, above[0], above[1], above[2])
-        assert tuple(_kernel.philox(words, block)[:4]) == expected
+    @pytest.mark.parametrize("answer", KNOWN_ANSWERS)
+    def test_known_answers(self, answer: str) -> None:
+        block, c1, c2, c3, key0, key1, *expected = (int(word, 16) for word in answer.split())
+        assert list(_kernel.philox((key0, key1, c1, c2, c3), block)[:4]) == expected
 
     def test_uniforms_are_the_words_of_the_blocks(self) -> None:
         expected = []
@@ -345,18 +341,52 @@ class TestNormalize:
         assert weights[2] > 0.0
         assert weights[3:].tolist() == [0.0, 0.0]
 
-    @pytest.mark.parametrize(
-        "log_weights",
-        [
-            [-np.inf, -np.inf],
-            [np.nan, 0.0],
-            [0.0, np.nan],
-            [0.0, -np.inf, np.nan, 1.0],
-            [np.inf, 0.0],
-        ],
-    )
-    def test_no_posterior_is_said_so(self, log_weights: list[float]) -> None:
-        assert _kernel.normalize(np.array(log_weights), False)[1] == 0
+    @pytest.mark.parametrize("given", ["-inf -inf", "nan 0", "0 nan", "0 -inf nan 1", "inf 0"])
+    def test_no_posterior_is_said_so(self, given: str) -> None:
+        assert _kernel.normalize(np.array(given.split(), float), False)[1] == 0
+
+
+class TestUpdate:
+    """Bayes' rule in one call: bit for bit what plain NumPy gives, column by column."""
+
+    @pytest.mark.parametrize("varies", [False, True])
+    def test_against_numpy(self, varies: bool) -> None:
+        draw, seen = np.random.default_rng(1), set()
+        for _ in range(2000):
+            count, size = int(draw.choice([1, 2, 7, 8, 9, 40])), int(draw.integers(1, 4))
+            states = np.round(draw.normal(size=(count, 2)))  # many alike, and -0.0
+            weights = draw.random(count) * (draw.random(count) < draw.choice([0.6, 1.0]))
+            weights = weights / weights.sum() if weights.any() else uniform_weights(count)
+            observed, mean = draw.uniform(-1, 1, size), draw.uniform(-1, 1, (count, size))
+            observed *= draw.choice([-0.0, 1e-160, 1.0, 9.0, 1e153, 1.7e308])
+            mean *= draw.choice([-0.0, 1e-160, 1.0, 9.0, 1e153, 1.7e308])
+            variance = np.exp(draw.normal(size=(count, size) if varies else size) * 9.0)
+            circular = [angle for angle in range(size) if draw.random() < 0.3]
+
+            with np.errstate(over="ignore", invalid="ignore"):
+                difference, distances = observed - mean, np.zeros(count)
+                for angle in circular:
+                    difference[:, angle] = wrapped(difference[:, angle])
+                for squares in (difference * difference / variance).T:
+                    distances += squares
+            log_likelihood = -0.5 * distances
+            for column in variance.T if varies else ():
+                log_likelihood -= 0.5 * log(column)
+            posterior, survivors = _kernel.normalize(log(weights) + log_likelihood, False)
+            own = posterior if survivors else weights
+            distinct = 1 + int(np.count_nonzero((states[1:] != states[:-1]).any(axis=1)))
+            numbers = survivors, 1.0 / _kernel.sum(own * own), distinct
+            nearest = np.where(weights > 0.0, distances, np.inf).min()
+
+            found = np.empty(count)
+            given = observed, mean, variance, circular
+            *sizes, squared = _kernel.update_by_gaussian(states, weights, *given, found) or (0.0,)
+            np.testing.assert_array_equal([*sizes, squared], [*numbers, nearest])
+            assert _kernel.update(states, weights, log_likelihood) == numbers
+            if survivors:
+                assert found.tobytes() == log_likelihood.tobytes() == posterior.tobytes()
+            seen.add((bool(circular), "finite" if squared < np.inf else str(squared)))
+        assert len(seen) == 5
 
 
 class TestResampling:

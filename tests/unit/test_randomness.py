@@ -33,12 +33,8 @@ named = partial(stream, 12, 3, 4, Purpose.PREDICTION)  # anew at each call
 
 GOLDEN_UNIFORM = ["0x1.f5ffc4fe43eadp-1", "0x1.191f6d04e75b5p-1", "0x1.b5b448943e518p-4"]
 GOLDEN_NORMAL = ["-0x1.562eb41142b4ap+1", "-0x1.b3e1ab7e0d64fp-1", "0x1.d872a84e8b3a0p-10"]
-GOLDEN_LATER = [
-    "0x1.873934e776fc0p-7",
-    "0x1.b7f0b9607e8a0p-4",
-    "0x1.26b96ba7abac6p-2",
-    "0x1.3002581272d4cp-3",
-]
+GOLDEN_LATER = ["0x1.873934e776fc0p-7", "0x1.b7f0b9607e8a0p-4"]
+GOLDEN_LATER += ["0x1.26b96ba7abac6p-2", "0x1.3002581272d4cp-3"]
 
 
 class TestNames:
@@ -46,21 +42,12 @@ class TestNames:
         """A change here changes every decision ever made, and makes old journals useless."""
         named = stream(2**40 + 5, 6, 7, Purpose.RESAMPLING)
         assert named.words == (5, 2**8, 3, 7, 6)
-        assert {purpose.name: purpose.value for purpose in Purpose} == {
-            "INITIAL_BELIEF": 1,
-            "PREDICTION": 2,
-            "RESAMPLING": 3,
-            "HYPOTHESES": 4,
-            "SELECTION": 5,
-            "MOVE_RESAMPLING": 6,
-            "REINITIALISATION": 7,
-            "RANK_TEST": 8,
-            "WORLD_INITIAL_STATE": 16,
-            "WORLD_MOTION": 17,
-            "WORLD_OBSERVATION": 18,
-            "WORLD_MEASURED_MOTION": 19,
-            "WORLD_MOVE_OBSERVATION": 20,
-        }
+        assert [purpose.value for purpose in Purpose] == [*range(1, 9), *range(16, 21)]
+        assert " ".join(purpose.name for purpose in Purpose) == (
+            "INITIAL_BELIEF PREDICTION RESAMPLING HYPOTHESES SELECTION MOVE_RESAMPLING "
+            "REINITIALISATION RANK_TEST WORLD_INITIAL_STATE WORLD_MOTION WORLD_OBSERVATION "
+            "WORLD_MEASURED_MOTION WORLD_MOVE_OBSERVATION"
+        )
 
     def test_a_substream_is_keyed_by_a_block_that_no_draw_uses(self) -> None:
         named = Stream((5, 6, 3, 7, 8))

@@ -90,18 +90,12 @@ def within(belief: Belief, variance: float, *observed: float) -> bool:
     return update(problem, belief, 0, observed)[1].within_gate
 
 
-def test_one_mode_of_two_is_no_alarm() -> None:
-    """It is far from the mean prediction of a belief that is nearly sure of another place."""
-    belief = Belief.weighted([[0.0], [10.0]], [0.999, 0.001])
-    assert within(belief, 0.01, 10.1)
-    assert not within(belief, 0.01, 12.0)
-
-
-def test_a_gap_between_few_particles_is_no_alarm() -> None:
-    """It is twenty deviations of the sensor from any of them."""
-    belief = Belief.uniform([[-1.0], [0.0], [1.0]])
-    assert within(belief, 0.0004, 0.5)
-    assert not within(belief, 0.0004, 3.0)
+def test_modes_and_gaps_are_no_alarm() -> None:
+    """Far from the mean of a belief that is nearly sure of another place; between few particles."""
+    two, three = Belief.weighted([[0.0], [10.0]], [0.999, 0.001]), Belief.uniform([[-1], [0], [1]])
+    for belief, variance, near, far in ((two, 0.01, 10.1, 12.0), (three, 0.0004, 0.5, 3.0)):
+        assert within(belief, variance, near)
+        assert not within(belief, variance, far)
 
 
 def test_angles_are_near_across_the_cut() -> None:

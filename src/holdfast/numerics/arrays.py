@@ -96,6 +96,8 @@ def real_number(value: object) -> float | None:
 
 def integer(value: object) -> int | None:
     """Return a whole number, NumPy's too; None for anything else, 3.0 and True included."""
+    if type(value) is int:
+        return value
     if _hides_something(value):
         return None
     try:
@@ -116,6 +118,8 @@ def whole(what: str, value: object, least: int, most: int | None = None) -> int:
 
 def floats(what: str, value: object) -> FloatArray:
     """Return real numbers as float64, in C order; otherwise InvalidValueError names ``what``."""
+    if type(value) is np.ndarray and value.dtype == np.float64 and value.flags.c_contiguous:
+        return value
     numbers = real_numbers(value)
     if numbers is None:
         raise InvalidValueError(f"{what} is {brief(value)}: must be real numbers {NOTHING_ELSE}")

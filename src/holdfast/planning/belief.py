@@ -12,6 +12,7 @@ still ranks them instead of turning every weight into zero.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -113,8 +114,7 @@ def _restored(states: FloatArray, weights: FloatArray) -> Belief:
 
 def uniform_weights(count: int) -> FloatArray:
     """Return ``count`` weights of ``1 / count``."""
-    weights = np.empty(count)
-    weights.fill(1.0 / count)
+    weights = np.full(count, 1.0 / count)
     weights.setflags(write=False)
     return weights
 
@@ -184,19 +184,14 @@ def standard_deviation(belief: Belief, circular: Sequence[int] = ()) -> FloatArr
     return np.sqrt(_kernel.weighted_sums(belief.weights, difference * difference))
 
 
-def effective_sample_size(belief: Belief) -> float:
-    """Return ``1 / sum(weights**2)`` (Kong, Liu and Wong 1994)."""
-    return 1.0 / _kernel.sum(belief.weights * belief.weights)
+def belief_sizes(belief: Belief) -> tuple[float, int]:
+    """Return ``1 / sum(weights**2)`` (Kong, Liu and Wong 1994), and how many particles differ.
 
-
-def distinct_particles(states: FloatArray) -> int:
-    """Return the number of different particles, of which copies stand side by side.
-
-    Resampling puts them there, and nothing moves them apart. Equal states that are no copies of one
-    (where a state has few values) count as often as they do not meet.
+    Copies of one count once as far as they stand side by side: resampling puts them there, and
+    nothing moves them apart. Equal states that are no copies of one (where a state has few values)
+    count as often as they do not meet.
     """
-    differs = states[1:] != states[:-1]
-    return 1 + int(np.count_nonzero(differs.any(axis=1)))
+    return _kernel.belief_sizes(*belief)
 
 
 def update(
@@ -227,31 +222,36 @@ def update(
         If the problem violates its contract.
     """
     observed = finite(observation)
-    if not has_general_observations(problem):
-        mean, variance = checked.prediction(problem, belief.states, sensing_action)
-        if mean.shape[-1] != observed.shape[0]:
-            raise InvalidValueError(
-                f"observation of {observed.shape[0]} coordinates: sensing action {sensing_action} "
-                f"gives {mean.shape[-1]}"
-            )
-        checked.require_usable(problem, sensing_action, mean, variance)
-        angles = circular_observation(problem, sensing_action, mean.shape[-1])
-        log_likelihood, distances = gaussian_log_likelihood(observed, mean, variance, angles)
-        squared_distance = float(np.where(belief.weights > 0.0, distances, np.inf).min())
-        explained = squared_distance <= VALIDATION_GATE_SQUARED
-        distance = float(np.sqrt(squared_distance))
-        # Most observations are near a particle, and cost no more than this comparison.
-        within_gate = squared_distance <= gate(observed.shape[0]) or is_within(
-            observed, mean, variance, belief.weights, angles
-        )
-    else:
-        distance = None
+    if has_general_observations(problem):
         log_likelihood = checked.log_likelihood(problem, belief.states, sensing_action, observed)
-        explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
-        within_gate = explained
-        if explained and rank_stream is not None:
+        within_gate = possible = _is_possible(belief, log_likelihood)
+        if possible and rank_stream is not None:
             within_gate = _is_typical(problem, belief, sensing_action, log_likelihood, rank_stream)
-    return _reweighted(belief, log_likelihood, explained, distance, within_gate)
+        sizes = _kernel.update(*belief, log_likelihood)
+        return _updated(belief, log_likelihood, sizes, possible, None, within_gate)
+    mean, variance = checked.prediction(problem, belief.states, sensing_action)
+    size = mean.shape[-1]
+    if size != observed.shape[0]:
+        raise InvalidValueError(
+            f"observation of {observed.shape[0]} coordinates: sensing action {sensing_action} "
+            f"gives {size}"
+        )
+    angles = circular_observation(problem, sensing_action, size)
+    posterior = np.empty(belief.weights.shape)
+    found = _kernel.update_by_gaussian(*belief, observed, mean, variance, angles, posterior)
+    if found is None:
+        raise checked.unusable(problem, sensing_action, mean, variance)
+    squared = found[3]
+    explained = squared <= VALIDATION_GATE_SQUARED
+    # Most observations are near a particle, and cost no more than this comparison.
+    within_gate = squared <= gate(size) or is_within(
+        observed, mean, variance, belief.weights, angles
+    )
+    return _updated(belief, posterior, found[:3], explained, math.sqrt(squared), within_gate)
+
+
+def _is_possible(belief: Belief, log_likelihood: FloatArray) -> bool:
+    return bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
 
 
 def _is_typical(
@@ -287,8 +287,9 @@ def update_by_move(
     """
     observed = finite(observation)
     log_likelihood = checked.move_log_likelihood(problem, belief.states, task_action, observed)
-    explained = bool(((log_likelihood > -np.inf) & (belief.weights > 0.0)).any())
-    return _reweighted(belief, log_likelihood, explained, None, explained)
+    possible = _is_possible(belief, log_likelihood)
+    sizes = _kernel.update(*belief, log_likelihood)
+    return _updated(belief, log_likelihood, sizes, possible, None, possible)
 
 
 def finite(observation: npt.ArrayLike) -> FloatArray:
@@ -301,43 +302,26 @@ def finite(observation: npt.ArrayLike) -> FloatArray:
     return observed
 
 
-def _reweighted(
+def _updated(
     belief: Belief,
-    log_likelihood: FloatArray,
+    posterior: FloatArray,
+    sizes: tuple[int, float, int],
     explained: bool,
     distance: float | None,
     within_gate: bool,
 ) -> tuple[Belief, ObservationInfo]:
-    weights, survivors = _kernel.normalize(numerics.log(belief.weights) + log_likelihood, False)
-    after = belief
-    if survivors:
-        weights.setflags(write=False)
-        after = Belief(belief.states, weights)
-    found = effective_sample_size(after), explained and survivors > 0, False
-    distinct = distinct_particles(belief.states)
-    return after, ObservationInfo(*found, distance, within_gate, distinct)
+    survivors, effective, distinct = sizes
+    explained = explained and survivors > 0
+    info = ObservationInfo(effective, explained, False, distance, within_gate, distinct)
+    return reweighted(belief, posterior, survivors), info
 
 
-def gaussian_log_likelihood(
-    observed: FloatArray, mean: FloatArray, variance: FloatArray, angles: Sequence[int]
-) -> tuple[FloatArray, FloatArray]:
-    """Return log p(observed | state) up to a constant, and the squared distances, shape (..., n).
-
-    The distance is the Mahalanobis distance from a particle's prediction.
-    """
-    # An overflow to infinity is correct: the observation is outside every validation gate.
-    with np.errstate(over="ignore"):
-        difference = differences(observed, mean, angles)
-        squares = difference * difference / variance
-        # Added column by column: np.sum may add in another order on another machine.
-        distance = squares[..., 0].copy()
-        for coordinate in range(1, squares.shape[-1]):
-            distance += squares[..., coordinate]
-    log_likelihood = -0.5 * distance
-    if variance.ndim > 1:
-        for coordinate in range(variance.shape[-1]):
-            log_likelihood -= 0.5 * numerics.log(variance[..., coordinate])
-    return log_likelihood, distance
+def reweighted(belief: Belief, posterior: FloatArray, survivors: int) -> Belief:
+    """Return a belief with the kernel's posterior weights; as it is if no particle survives."""
+    if not survivors:
+        return belief
+    posterior.setflags(write=False)
+    return Belief(belief.states, posterior)
 
 
 def resample(belief: Belief, stream: Stream) -> Belief:
@@ -347,10 +331,9 @@ def resample(belief: Belief, stream: Stream) -> Belief:
     times: Carpenter, Clifford and Fearnhead (1999), "Improved particle filter for nonlinear
     problems".
     """
-    indices = _kernel.systematic_resample(belief.weights, float(stream.anew().uniform()))
-    states = belief.states[indices]
-    states.setflags(write=False)
-    return Belief(states, uniform_weights(belief.weights.shape[0]))
+    states, weights = np.empty(belief.states.shape), np.empty(belief.weights.shape)
+    _kernel.resample(*belief, stream.words, states, weights)
+    return _restored(states, weights)
 
 
 def regularised(

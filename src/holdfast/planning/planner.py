@@ -40,8 +40,7 @@ from holdfast.planning import interruption, sensing
 from holdfast.planning.belief import (
     Belief,
     ObservationInfo,
-    distinct_particles,
-    effective_sample_size,
+    belief_sizes,
     estimate,
     regularised,
     resample,
@@ -63,6 +62,8 @@ from holdfast.problems.attributes import (
 from holdfast.problems.problem import Problem
 
 CHECKPOINT_VERSION = 1
+
+_LITTLE_ENDIAN = np.dtype("<f8")
 
 
 class PlanningState(NamedTuple):
@@ -253,8 +254,7 @@ class Planner:
         self._require_size(state)
         chosen = sensing_action_of(problem, sensing_action, optional=observation is None)
         if observation is None:
-            size = effective_sample_size(state.belief)
-            distinct = distinct_particles(state.belief.states)
+            size, distinct = belief_sizes(state.belief)
             info = ObservationInfo(size, True, False, distinct_particles=distinct)
             return state._replace(sensed=True), info
         ranks = None
@@ -262,7 +262,7 @@ class Planner:
             ranks = stream(state.seed, state.trial, state.step, Purpose.RANK_TEST)
         updated = update(problem, state.belief, chosen, observation, ranks)
         belief, info = self._resampled(state, *updated, Purpose.RESAMPLING)
-        return state._replace(sensed=True, belief=belief), info
+        return PlanningState(*state[:4], True, belief), info
 
     @in_own_mode
     def observe_move(
@@ -293,14 +293,13 @@ class Planner:
         count = belief.weights.shape[0]
         threshold = self.settings.particle_filter.resampling_threshold * count
         # Rounding may leave the size of equal weights a little above their number.
-        resampled = threshold == count or found.effective_sample_size <= threshold
-        if resampled:
-            own = stream(state.seed, state.trial, state.step, purpose)
-            drawn = resample(belief, own)
-            if static := static_parameters(self.problem):
-                drawn = regularised(drawn, belief, static, circular_states(self.problem), own)
-            belief = drawn
-        return belief, found._replace(resampled=resampled)
+        if threshold != count and found.effective_sample_size > threshold:
+            return belief, found
+        own = stream(state.seed, state.trial, state.step, purpose)
+        drawn = resample(belief, own)
+        if static := static_parameters(self.problem):
+            drawn = regularised(drawn, belief, static, circular_states(self.problem), own)
+        return drawn, found._replace(resampled=True)
 
     @in_own_mode
     def reinitialise(self, state: PlanningState) -> PlanningState:
@@ -478,19 +477,10 @@ def digest(state: PlanningState) -> bytes:
     BLAKE2b over all fields; the belief's arrays as little-endian float64 in C order.
     """
     states, weights = state.belief
-    header = struct.pack(
-        "<QQQQ?QQ",
-        state.seed,
-        state.trial,
-        state.step,
-        state.stage,
-        state.sensed,
-        states.shape[0],
-        states.shape[1],
-    )
+    header = struct.pack("<QQQQ?QQ", *state[:5], *states.shape)
     hashed = hashlib.blake2b(header, digest_size=32, person=b"holdfast-state")
-    hashed.update(np.ascontiguousarray(states, dtype="<f8").data)
-    hashed.update(np.ascontiguousarray(weights, dtype="<f8").data)
+    for array in (states, weights):
+        hashed.update(np.asarray(array, _LITTLE_ENDIAN, order="C").data)
     return hashed.digest()
 
 

@@ -12,6 +12,7 @@ What goes wrong raises as it does alone, without saying for which state.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -23,14 +24,7 @@ from holdfast.numerics.arrays import FloatArray
 from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.numerics.randomness import Purpose, stream
 from holdfast.planning import interruption
-from holdfast.planning.belief import (
-    Belief,
-    effective_sample_size,
-    estimate,
-    finite,
-    gaussian_log_likelihood,
-    resample,
-)
+from holdfast.planning.belief import Belief, estimate, finite, resample, reweighted
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.planning.sensing import choose_sensing_action, predict
 from holdfast.planning.settings import UNINFORMED_METHODS
@@ -67,22 +61,19 @@ def observe_together(
         interruption.check()
         chosen = attributes.sensing_action_of(problem, action)
         beliefs = [states[row].belief for row in rows]
-        weights = np.array([belief.weights for belief in beliefs])
         mean, variance = checked.prediction(problem, _stacked(beliefs), chosen)
-        checked.require_usable(problem, chosen, mean, variance)
-        observed = np.array([[finite(observations[row])] for row in rows])
-        if observed.shape[-1] != mean.shape[-1]:
-            raise InvalidValueError(f"observations that sensing action {action} does not give")
+        variances = variance if variance.ndim > 1 else itertools.repeat(variance)
         angles = attributes.circular_observation(problem, chosen, mean.shape[-1])
-        likelihoods, _ = gaussian_log_likelihood(observed, mean, variance, angles)
-        log_weights = numerics.log(weights) + likelihoods
-        for row, belief, own in zip(rows, beliefs, log_weights, strict=True):
-            posterior, survivors = _kernel.normalize(own, False)
-            if survivors:
-                posterior.setflags(write=False)
-                belief = Belief(belief.states, posterior)
-            state = states[row]
-            if threshold == count or effective_sample_size(belief) <= threshold:
+        for row, belief, shown, spread in zip(rows, beliefs, mean, variances, strict=False):
+            observed, posterior = finite(observations[row]), np.empty(count)
+            if observed.shape[0] != shown.shape[1]:
+                raise InvalidValueError(f"observations that sensing action {action} does not give")
+            found = _kernel.update_by_gaussian(*belief, observed, shown, spread, angles, posterior)
+            if found is None:
+                raise checked.unusable(problem, chosen, mean, variance)
+            survivors, size = found[:2]
+            state, belief = states[row], reweighted(belief, posterior, survivors)
+            if threshold == count or size <= threshold:
                 name = state.seed, state.trial, state.step, Purpose.RESAMPLING
                 belief = resample(belief, stream(*name))
             after[row] = state._replace(sensed=True, belief=belief)

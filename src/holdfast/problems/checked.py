@@ -104,16 +104,22 @@ def _variance(
 def require_usable(
     problem: Any, sensing_action: int, mean: FloatArray, variance: FloatArray
 ) -> None:
-    """Raise the error about the first entry of a prediction that no observation can have."""
-    if _kernel.all_within(variance, *_POSITIVE) and _kernel.all_finite(mean):
-        return
+    """Raise an error if no observation can have such a prediction."""
+    if not _kernel.all_within(variance, *_POSITIVE) or not _kernel.all_finite(mean):
+        raise unusable(problem, sensing_action, mean, variance)
+
+
+def unusable(
+    problem: Any, sensing_action: int, mean: FloatArray, variance: FloatArray
+) -> ProblemError:
+    """Return the error about the first entry of a prediction that no observation can have."""
     function, values, need = "observation_mean", mean, "finite"
     unusable = ~np.isfinite(mean)
     if not unusable.any():
         function, values, need = "observation_variance", variance, "positive and finite"
         unusable = ~((variance > 0.0) & (variance < np.inf))
     index = tuple(map(int, np.argwhere(unusable)[0]))
-    raise ProblemError(
+    return ProblemError(
         f"{function} of {name_of(problem)}, sensing action {sensing_action}, is {values[index]} at "
         f"{_written(index)} of shape {_written(values.shape)}: every entry must be {need}"
     )
