@@ -29,6 +29,7 @@ from tests.processes.faults import (
     wait_for_end,
 )
 
+from holdfast.cli.exit_codes import EXIT_CAN_GO_ON
 from holdfast.journal.journal import Journal
 
 PEG = "peg_in_hole_2d"
@@ -100,7 +101,7 @@ class TestProblem:
         story.at("perform", 12, mark.touch, afterwards=True)
         variables = {"HOLDFAST_TEST_STUCK": str(mark)}
         robot = site.run(story.file, services=[cloud], variables=variables)
-        assert robot.wait() == 2
+        assert robot.wait() == EXIT_CAN_GO_ON
         (told,) = robot.matching("error")
         assert told["reason"] == (
             "trial 0 (seed 3), step 12: gated_problem:GatedPeg raised RuntimeError: the wheels are "
@@ -121,7 +122,7 @@ class TestProblem:
         assert unfinished_steps(robot.out) == list(range(13))
         # It is still stuck: then the journal cannot be read, which says the same.
         again = site.run(story.file, services=[cloud], variables=variables, resume=True)
-        assert again.wait() == 2
+        assert again.wait() == EXIT_CAN_GO_ON
         (told,) = again.matching("error")
         assert told["reason"].startswith(
             "trial 0 (seed 3), as the journal has it: gated_problem:GatedPeg raised RuntimeError: "
