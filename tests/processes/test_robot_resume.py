@@ -15,10 +15,8 @@ import pytest
 from tests.processes import gated_problem
 from tests.processes.faults import (
     COMMAND,
-    HERE,
     LOCAL_RECOVERY,
     PATIENT,
-    PROBLEMS,
     References,
     Site,
     Story,
@@ -28,15 +26,10 @@ from tests.processes.faults import (
     unfinished_steps,
     wait_for_end,
 )
+from tests.processes.test_faults import GATED, PEG, PEG_AND_SLOWLY_ALL, SERVES_GATED
 
 from holdfast.cli.exit_codes import EXIT_CAN_GO_ON
 from holdfast.journal.journal import Journal
-
-PEG = "peg_in_hole_2d"
-PEG_AND_SLOWLY_ALL = [
-    PEG,
-    *(pytest.param(name, marks=pytest.mark.slow) for name in PROBLEMS if name != PEG),
-]
 
 
 class TestKilled:
@@ -87,16 +80,8 @@ class TestProblem:
     def test_a_transition_that_raises_in_the_robot_alone(
         self, site: Site, references: References
     ) -> None:
-        document = {
-            **document_of(PEG, max_steps=40),
-            "problem": "gated_problem:GatedPeg",
-            "problem_directory": str(HERE),
-        }
-        cloud = site.service(
-            "--problem", "gated_problem:GatedPeg", "--problem-directory", str(HERE)
-        )
-        cloud.start()
-        story = Story(site, references, document)
+        cloud = site.service(*SERVES_GATED).start()
+        story = Story(site, references, GATED)
         mark = site.directory / "stuck"
         story.at("perform", 12, mark.touch, afterwards=True)
         variables = {"HOLDFAST_TEST_STUCK": str(mark)}
@@ -107,11 +92,8 @@ class TestProblem:
             "trial 0 (seed 3), step 12: gated_problem:GatedPeg raised RuntimeError: the wheels are "
             "stuck"
         )
-        line = next(
-            number
-            for number, text in enumerate(Path(gated_problem.__file__).read_text().splitlines(), 1)
-            if "raise RuntimeError" in text
-        )
+        lines = Path(gated_problem.__file__).read_text().splitlines()
+        (line,) = (number for number, text in enumerate(lines, 1) if "raise RuntimeError" in text)
         assert told["details"] == (
             f'  File "{gated_problem.__file__}", line {line}, in move\n'
             '    raise RuntimeError("the wheels are stuck")'
