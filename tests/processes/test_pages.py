@@ -92,7 +92,7 @@ def run(
         )
         environment = {**environment, "PYTHONPATH": str(absent)}
     return subprocess.run(
-        command, cwd=directory, env=environment, capture_output=True, text=True, timeout=240
+        command, cwd=directory, env=environment, capture_output=True, text=True, timeout=1800
     )
 
 

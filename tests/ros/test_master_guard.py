@@ -164,15 +164,14 @@ class TestItsOwnMaster:
     def test_its_journal_is_removed(self, graph: Graph, loss: str) -> None:
         guard = graph.guard("--no-rosout")
         graph.run("rosparam", "set", "/speed", "1")
-        journal = graph.journal
-        wait_for(lambda: b"speed" in journal.read_bytes())  # no write is left
+        wait_for(lambda: b"speed" in graph.journal.read_bytes())  # no write is left
         if loss == "file":
-            journal.unlink()
+            graph.journal.unlink()
         else:
-            journal.parent.rename(graph.directory / "taken")
+            graph.journal.parent.rename(graph.directory / "taken")
         replaced(graph, graph.kill_master())
         assert graph.registered()["parameters"]["speed"] == 1
-        wait_for(journal.exists)
+        wait_for(graph.journal.exists)
         assert not graph.events(guard, "journal_failed")
 
     def test_a_journal_that_cannot_be_read_is_named(self, graph: Graph) -> None:
