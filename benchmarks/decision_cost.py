@@ -23,7 +23,7 @@ from holdfast.config import registry
 from holdfast.config.registry import BUILT_IN
 from holdfast.errors import HoldfastError
 from holdfast.planning.planner import Planner
-from holdfast.protocol.decision_cost import cost_of_reaching, cost_of_sensing, describe_cost
+from holdfast.protocol.decision_cost import Pricing, describe_cost
 from holdfast.protocol.service_sessions import with_cores
 from holdfast.service.calibration import measure_problem, measure_slowness
 
@@ -47,7 +47,8 @@ def main() -> None:
         problem = registry.problem_class(name).from_settings({}, {})
         settings = with_cores(random_settings(chance), 1)
         own = measure_problem(problem)
-        sensing = cost_of_sensing(problem, settings, own, slowness)
+        price = Pricing(slowness).price_of(problem, settings, own)
+        sensing = price.sensing
         if not options.least_s <= sensing.seconds <= options.most_s or sensing.num_bytes > 1 << 30:
             continue
         done += 1
@@ -79,8 +80,7 @@ def main() -> None:
         except HoldfastError as error:
             print(f"failed {error}")
             continue
-        reaching = cost_of_reaching(problem, settings, own, slowness)
-        reach = reaching.cost(steps=steps, inputs=inputs, begins=True, num_bytes=0)
+        reach = price.reaching.cost(steps=steps, inputs=inputs, begins=True, num_bytes=0)
         kind: str = method
         if method in ("action_entropy", "path_entropy", "state_entropy"):
             kind += f" {settings.selector.estimator}"

@@ -68,7 +68,7 @@ def break_even_lines(lines: pd.DataFrame) -> Figure:
     lines = lines[kinds["particles"].transform("count") > 0]
     ends = {kind_of(row): row["measured_to"] for row in lines.to_dict("records")}
     figure, (panel,) = plots.stacked_panels(
-        [round(1.5 * len(ends))],
+        [max(2, round(1.5 * len(ends)))],  # on a busy machine there may be no line at all
         title="Beyond how many particles a service is faster than the robot's one core",
         width=9.2,
     )

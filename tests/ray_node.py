@@ -15,7 +15,7 @@ import pytest
 from holdfast.runtime.parent_death import parent_death_prefix
 from holdfast_lab.testbed.processes import free_port
 
-PATIENCE_S = 180.0
+PATIENCE_S = 360.0
 
 
 @contextlib.contextmanager
@@ -38,7 +38,7 @@ def ray_node(cores: int) -> Iterator[tuple[str, str]]:
         patch.setenv("RAY_AUTH_MODE", "token")
         patch.setenv("RAY_AUTH_TOKEN", secrets.token_hex())
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        patch.setenv("RAY_raylet_start_wait_time_s", "120")
+        patch.setenv("RAY_raylet_start_wait_time_s", "300")
         patch.setenv("GRPC_ENABLE_FORK_SUPPORT", "0")  # its server forks between gRPC's threads
         patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
         log = directory / "log"

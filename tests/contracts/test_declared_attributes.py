@@ -141,7 +141,7 @@ def test_a_size_that_cannot_be_set() -> None:
         hf.Planner(kind())
 
 
-def test_a_figure(tmp_path: Path) -> None:
+def test_a_figure() -> None:
     figure = pytest.importorskip("holdfast.reports.figure")
     example = Path(__file__).parents[2] / "examples" / "peg_in_hole_2d.yaml"
     configuration = hf.load_configuration(example)
@@ -153,6 +153,5 @@ def test_a_figure(tmp_path: Path) -> None:
         recorder = Recorder(0, planner)
         hf.run_trial(planner, 4, max_steps=6, observer=recorder)
         shown = dataclasses.replace(configuration, problem=problem, problem_name="turning")
-        figure.trial_figure(shown, recorder.record, tmp_path / "trial.png")
-        pictures.append((tmp_path / "trial.png").read_bytes())
+        pictures.append(figure.trial_figure(shown, recorder.record))
     assert pictures[0] == pictures[1]

@@ -256,11 +256,11 @@ async def test_what_came_while_a_robot_stood_still_is_read_before_anybody_is_giv
             still_s[0] = 0.0
         return found
 
-    async with service_process(tcp.endpoint("cloud"), "b1", lease_ms=300.0):
+    async with service_process(tcp.endpoint("cloud"), "b1", lease_ms=1000.0):
         robot, inbox = await joined(tcp)
         monkeypatch.setattr(selector, "select", select)
         for number in range(2):
-            still_s[0] = 0.6
+            still_s[0] = 1.5
             await until(lambda: still_s[0] == 0.0)
             await answers(robot, inbox, number, b"echo")
         assert not any(isinstance(each, ServiceVanished) for each in inbox.events)

@@ -24,8 +24,10 @@ from holdfast.config import yaml_document
 from holdfast.planning import inputs
 from holdfast.planning import planner as planning
 from holdfast.protocol import messages
+from holdfast.transport import frames
 
 _INSTRUMENTED: dict[str, tuple[types.ModuleType, ...]] = {
+    "hello": (targets, frames),
     "request": (targets, messages),
     "reply": (targets, messages),
     "record": (targets, inputs),

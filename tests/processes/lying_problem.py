@@ -45,4 +45,4 @@ class LyingPeg(PegInHole2D):
 
 
 def _is_verifying() -> bool:
-    return threading.current_thread().name.startswith("holdfast-answer-check")
+    return threading.current_thread().name.startswith("holdfast-own-planner")

@@ -21,8 +21,6 @@ GATED = {
     "problem": "gated_problem:GatedPeg",
     "problem_directory": str(faults.HERE),
 }
-
-
 SERVES_GATED = ("--problem", "gated_problem:GatedPeg", "--problem-directory", str(faults.HERE))
 
 

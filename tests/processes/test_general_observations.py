@@ -29,7 +29,7 @@ def service(*options: str) -> Iterator[str]:
         yield endpoint
     finally:
         process.terminate()
-        process.communicate(timeout=30)
+        process.communicate(timeout=120)
 
 
 def test_the_example_has_nothing_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:

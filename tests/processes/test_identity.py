@@ -48,7 +48,7 @@ def test_a_robot_without_a_certificate_has_the_name_that_it_says(
 ) -> None:
     cloud = site.service().start()
     Story(site, references, document_of(PEG), offload={"name": "anna"}).run(cloud)
-    assert cloud.process.matching("robot_connected", robot="anna")
+    cloud.process.wait_for("robot_connected", robot="anna")
 
 
 @pytest.mark.parametrize(

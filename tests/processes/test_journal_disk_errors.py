@@ -35,7 +35,7 @@ def said_when_struck(path: Path, fault: str, number: int) -> list[str] | None:
     command = ["strace", "-f", "-qq", "-o", str(trace)]
     command += ["-e", f"trace={_CALLS}", "-e", f"inject={_CALLS}:{fault}:when={number}"]
     writer = Path(__file__).with_name("journal_writer.py")
-    done = completed([*command, sys.executable, str(writer), str(path)], timeout=60)
+    done = completed([*command, sys.executable, str(writer), str(path)], timeout=240)
     assert "Traceback" not in done.stderr, done.stderr
     struck = "INJECTED" in trace.read_text() or done.returncode != 0
     return done.stdout.splitlines() if struck else None

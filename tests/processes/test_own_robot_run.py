@@ -24,7 +24,7 @@ from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.robot.environment_maker import load_environment
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_robot"
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 
 
 class Controller:

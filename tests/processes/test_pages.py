@@ -92,7 +92,7 @@ def run(
         )
         environment = {**environment, "PYTHONPATH": str(absent)}
     return subprocess.run(
-        command, cwd=directory, env=environment, capture_output=True, text=True, timeout=240
+        command, cwd=directory, env=environment, capture_output=True, text=True, timeout=1800
     )
 
 
@@ -106,7 +106,7 @@ def in_background() -> Iterator[Callable[[list[str], Path], None]]:
 
     def end(process: subprocess.Popen[str]) -> None:
         process.terminate()
-        process.communicate(timeout=30)
+        process.communicate(timeout=120)
 
     def start(command: list[str], directory: Path) -> None:
         where = command[command.index("--listen") + 1] if "--listen" in command else str(command)

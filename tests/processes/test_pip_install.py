@@ -12,7 +12,7 @@ def test_it_ends_as_pip_does_and_passes_its_complaint_on(tmp_path: Path) -> None
     python.write_text('#!/bin/sh\necho "$@"\necho "ERROR: no such package" >&2\nexit 3\n')
     python.chmod(0o755)
     log = tmp_path / "pip.log"
-    done = completed([PIP_INSTALL, python, log, "-e", ".[dev]"], timeout=60)
+    done = completed([PIP_INSTALL, python, log, "-e", ".[dev]"], timeout=120)
     assert done.returncode == 3
     assert done.stderr == "ERROR: no such package\n"
     (line,) = done.stdout.splitlines()

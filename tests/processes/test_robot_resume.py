@@ -15,10 +15,8 @@ import pytest
 from tests.processes import gated_problem
 from tests.processes.faults import (
     COMMAND,
-    HERE,
     LOCAL_RECOVERY,
     PATIENT,
-    PROBLEMS,
     References,
     Site,
     Story,
@@ -28,14 +26,10 @@ from tests.processes.faults import (
     unfinished_steps,
     wait_for_end,
 )
+from tests.processes.test_faults import GATED, PEG, PEG_AND_SLOWLY_ALL, SERVES_GATED
 
+from holdfast.cli.exit_codes import EXIT_CAN_GO_ON
 from holdfast.journal.journal import Journal
-
-PEG = "peg_in_hole_2d"
-PEG_AND_SLOWLY_ALL = [
-    PEG,
-    *(pytest.param(name, marks=pytest.mark.slow) for name in PROBLEMS if name != PEG),
-]
 
 
 class TestKilled:
@@ -54,7 +48,7 @@ class TestKilled:
         story.at("sense", steps[4], site.kill_robot, afterwards=True)
         assert story.run_and_resume(cloud) == 3
         # Each robot came with a higher epoch, so the cloud has taken the session over.
-        assert len(cloud.process.matching("session_taken_over")) >= 1
+        cloud.process.wait_for("session_taken_over")
 
     def test_its_local_service_ends_with_it(self, site: Site, references: References) -> None:
         document = document_of(PEG)
@@ -86,31 +80,20 @@ class TestProblem:
     def test_a_transition_that_raises_in_the_robot_alone(
         self, site: Site, references: References
     ) -> None:
-        document = {
-            **document_of(PEG, max_steps=40),
-            "problem": "gated_problem:GatedPeg",
-            "problem_directory": str(HERE),
-        }
-        cloud = site.service(
-            "--problem", "gated_problem:GatedPeg", "--problem-directory", str(HERE)
-        )
-        cloud.start()
-        story = Story(site, references, document)
+        cloud = site.service(*SERVES_GATED).start()
+        story = Story(site, references, GATED)
         mark = site.directory / "stuck"
         story.at("perform", 12, mark.touch, afterwards=True)
         variables = {"HOLDFAST_TEST_STUCK": str(mark)}
         robot = site.run(story.file, services=[cloud], variables=variables)
-        assert robot.wait() == 2
+        assert robot.wait() == EXIT_CAN_GO_ON
         (told,) = robot.matching("error")
         assert told["reason"] == (
             "trial 0 (seed 3), step 12: gated_problem:GatedPeg raised RuntimeError: the wheels are "
             "stuck"
         )
-        line = next(
-            number
-            for number, text in enumerate(Path(gated_problem.__file__).read_text().splitlines(), 1)
-            if "raise RuntimeError" in text
-        )
+        lines = Path(gated_problem.__file__).read_text().splitlines()
+        (line,) = (number for number, text in enumerate(lines, 1) if "raise RuntimeError" in text)
         assert told["details"] == (
             f'  File "{gated_problem.__file__}", line {line}, in move\n'
             '    raise RuntimeError("the wheels are stuck")'
@@ -121,7 +104,7 @@ class TestProblem:
         assert unfinished_steps(robot.out) == list(range(13))
         # It is still stuck: then the journal cannot be read, which says the same.
         again = site.run(story.file, services=[cloud], variables=variables, resume=True)
-        assert again.wait() == 2
+        assert again.wait() == EXIT_CAN_GO_ON
         (told,) = again.matching("error")
         assert told["reason"].startswith(
             "trial 0 (seed 3), as the journal has it: gated_problem:GatedPeg raised RuntimeError: "
@@ -250,8 +233,8 @@ class TestEpoch:
         older = site.run(file, services=[cloud], out="older")
         assert older.wait() == 2
         assert "another process has resumed this run, so this one stops" in older.output
-        assert cloud.process.matching("session_taken_over")
-        assert cloud.process.matching("refused", code="stale_epoch")
+        cloud.process.wait_for("session_taken_over")
+        cloud.process.wait_for("refused", code="stale_epoch")
         # The service may have chosen what to sense next before it was overtaken. It refuses what is
         # asked then, while the robot moves: this one stops where it should sense again, or before.
         assert world.step <= steps[4]

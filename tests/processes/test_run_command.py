@@ -124,7 +124,7 @@ class HeldRun:
         self._marks.with_name("go").touch()
 
     def end(self) -> str:
-        _, errors = self.process.communicate(timeout=60)
+        _, errors = self.process.communicate(timeout=120)
         return errors
 
 
@@ -288,7 +288,7 @@ class TestInterruption:
     ) -> None:
         held_run.wait_for_workers()
         os.kill(held_run.process.pid, signal.SIGKILL)
-        held_run.process.wait(timeout=60)
+        held_run.process.wait(timeout=120)
         wait_until(
             lambda: not any(is_alive(pid) for pid in held_run.workers()), "the end of the workers"
         )
@@ -378,7 +378,7 @@ def test_of_two_runs_at_once_in_one_directory_one_is_done(tmp_path: Path) -> Non
             )
             for seed in (1, 2)
         ]
-        errors = [process.communicate(timeout=60)[1] for process in both]
+        errors = [process.communicate(timeout=120)[1] for process in both]
         codes = [process.returncode for process in both]
         assert sorted(codes) == [0, 2], errors
         winner = 1 + codes.index(0)

@@ -30,7 +30,7 @@ from holdfast.protocol.messages import (
     with_checksum,
 )
 
-PATIENCE_S = 30.0
+PATIENCE_S = 120.0
 COMMAND = [sys.executable, "-m", "holdfast", "serve"]
 
 # Computes in Python until a file appears, and never sleeps: nothing but the interpreter's own

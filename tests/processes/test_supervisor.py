@@ -14,7 +14,7 @@ from tests.ports import free_port
 from tests.processes import faults
 from tests.processes.world import World
 
-PATIENCE_S = 30.0
+PATIENCE_S = 120.0
 PEG = "peg_in_hole_2d"
 
 # Its import ends the process if a file says so.

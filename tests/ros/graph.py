@@ -156,6 +156,7 @@ class Graph(AtMaster):
             XDG_RUNTIME_DIR=str(directory / "run"),
         )
         (directory / "run").mkdir()
+        self.journal = directory / "run" / "ros1_master_guard" / f"master-{self.port}.journal"
         self._processes: list[Process] = []
         self._masters: set[int] = set()
         self._guard: Process | None = None
@@ -209,7 +210,7 @@ class Graph(AtMaster):
 
     def events(self, guard: Process, name: str) -> list[dict[str, Any]]:
         """Return a guard's events of one kind."""
-        events = [json.loads(line) for line in guard.errors.splitlines() if line.startswith("{")]
+        events = [json.loads(line) for line in guard.errors.split("\n")[:-1] if line[:1] == "{"]
         return [event for event in events if event["event"] == name]
 
     def master_pid(self) -> int:
@@ -300,6 +301,13 @@ def keeps_on(process: Process, more: int = 5) -> None:
 def replaced(graph: Graph, killed: int) -> None:
     """Wait until another master answers."""
     wait_for(lambda: graph.master_pid() != killed)
+
+
+def known_to_guard(graph: Graph) -> None:
+    """Wait until the guard knows all that a master of others, which it asks, knows by now."""
+    for mark in (b"asked", b"asked_again"):  # the first may come between two of its questions
+        assert graph.ask("setParam", f"/{mark.decode()}", 1)[0] == 1
+        wait_for(lambda: mark in graph.journal.read_bytes())  # noqa: B023
 
 
 def start_everything(graph: Graph) -> tuple[Process, Process]:

@@ -12,11 +12,18 @@ from pathlib import Path
 import pytest
 from tests.process_states import alive, stop
 from tests.ros.conftest import PATIENCE_S
-from tests.ros.graph import Graph, keeps_on, replaced, settled, start_everything, topic_tool
+from tests.ros.graph import (
+    Graph,
+    keeps_on,
+    known_to_guard,
+    replaced,
+    settled,
+    start_everything,
+    topic_tool,
+)
 from tests.ros.ros1_processes import SYSTEM_PYTHON, wait_for
 
 GUARD = (sys.executable, "-m", "holdfast", "ros1-guard")
-KILLS = 10
 
 
 @pytest.fixture
@@ -91,8 +98,8 @@ class TestItsOwnMaster:
         assert "/doomed" not in graph.registered()["nodes"]
         assert "/doomed_work" not in graph.registered()["services"]
         assert {"/work", "/mux/select"} <= graph.registered()["services"].keys()
-        (_, started) = graph.events(guard, "master_started")
-        assert started["gone"] == ["/doomed"]
+        wait_for(lambda: len(graph.events(guard, "master_started")) == 2)
+        assert graph.events(guard, "master_started")[1]["gone"] == ["/doomed"]
         keeps_on(caller)
 
     def test_a_node_that_is_stopped_is_kept(self, graph: Graph) -> None:
@@ -103,6 +110,7 @@ class TestItsOwnMaster:
         stop(server.process.pid)
         replaced(graph, graph.kill_master())
         assert graph.registered()["services"] == before["services"]
+        wait_for(lambda: len(graph.events(guard, "master_started")) == 2)
         assert graph.events(guard, "master_started")[1]["silent"] == ["/stopped"]
         os.kill(server.process.pid, signal.SIGCONT)
         graph.run("rosservice", "call", "/work")
@@ -156,15 +164,14 @@ class TestItsOwnMaster:
     def test_its_journal_is_removed(self, graph: Graph, loss: str) -> None:
         guard = graph.guard("--no-rosout")
         graph.run("rosparam", "set", "/speed", "1")
-        journal = graph.directory / "run" / "ros1_master_guard" / f"master-{graph.port}.journal"
-        wait_for(lambda: journal.exists() and b"speed" in journal.read_bytes())  # no write is left
+        wait_for(lambda: b"speed" in graph.journal.read_bytes())  # no write is left
         if loss == "file":
-            journal.unlink()
+            graph.journal.unlink()
         else:
-            journal.parent.rename(graph.directory / "taken")
+            graph.journal.parent.rename(graph.directory / "taken")
         replaced(graph, graph.kill_master())
         assert graph.registered()["parameters"]["speed"] == 1
-        wait_for(journal.exists)
+        wait_for(graph.journal.exists)
         assert not graph.events(guard, "journal_failed")
 
     def test_a_journal_that_cannot_be_read_is_named(self, graph: Graph) -> None:
@@ -312,9 +319,10 @@ class TestAMasterOfOthers:
         guard = graph.guard()
         assert '"master":"found"' in guard.lines[0]
         caller, listener = start_everything(graph)
-        before = settled(graph)
+        settled(graph)
+        known_to_guard(graph)
+        before = graph.listed()
         for _ in range(3):
-            time.sleep(1.0)  # it is asked four times a second
             replaced(graph, graph.kill_master())
             assert graph.listed() == before
             graph.newcomer("/relayed", "/more_work")
@@ -333,19 +341,18 @@ class TestAMasterOfOthers:
     def test_what_cannot_be_written_down_is_known_to_the_next_one(self, graph: Graph) -> None:
         graph.start("rosmaster", "--core", "-p", str(graph.port))
         wait_for(graph.master_pid)
-        (directory := graph.directory / "kept").symlink_to("run")
-        guard = graph.guard("--no-rosout", "--directory", str(directory))
-        (unusable := graph.directory / "unusable").symlink_to(__file__)
-        unusable.replace(directory)  # at once, whatever the guard is writing
+        guard = graph.guard("--no-rosout")
+        wait_for(graph.journal.exists)  # it is written next when something has changed
+        (unusable := graph.journal.with_name(f"{graph.journal.name}.new")).mkdir()
         graph.run("rosparam", "set", "/speed", "1")
         wait_for(lambda: graph.events(guard, "journal_failed"))
         time.sleep(1.0)
         assert len(graph.events(guard, "journal_failed")) == 1
         replaced(graph, graph.kill_master())
         assert graph.registered()["parameters"]["speed"] == 1
-        directory.unlink()
+        unusable.rmdir()
         wait_for(lambda: graph.events(guard, "journal_written"))
-        assert list(directory.glob("*.journal"))
+        assert b"speed" in graph.journal.read_bytes()
 
     def test_roscore(self, graph: Graph) -> None:
         roscore = graph.start("roscore", "-p", str(graph.port))
@@ -353,7 +360,7 @@ class TestAMasterOfOthers:
         guard = graph.guard()
         server = graph.node("server", "/server", "/work")
         wait_for(lambda: server.lines)
-        time.sleep(1.0)
+        known_to_guard(graph)
         run_id = graph.run("rosparam", "get", "/run_id")
         graph.kill_master()
         # It takes the master's death for the end of everything, but what is not its goes on.

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from tests.process_states import stop
-from tests.ros.conftest import line_of
+from tests.ros.conftest import PATIENCE_S, line_of
 from tests.ros.ros1_processes import HOLDFAST, SYSTEM_PYTHON, Ros1, ros1_in, wait_for
 from tests.unit.test_ros_client import in_process
 
@@ -348,13 +348,13 @@ class TestTheMasterDies:
 def test_rosnode_kill_ends_it(around: Ros1) -> None:
     cloud = around.serve(CLOUD, EXAMPLE)
     around.run("rosnode", "kill", f"/{CLOUD}")
-    assert cloud.wait(30.0) == 0
+    assert cloud.wait(PATIENCE_S) == 0
     assert around.service_uri(CLOUD) is None
 
 
 def test_the_later_one_of_a_name_has_it_and_the_earlier_one_ends(around: Ros1) -> None:
     first, second = (around.serve(CLOUD, EXAMPLE) for _ in range(2))
-    assert first.wait(30.0) == 0
+    assert first.wait(PATIENCE_S) == 0
     assert around.service_uri(CLOUD) is not None
     assert second.poll() is None
 

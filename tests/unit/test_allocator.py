@@ -46,7 +46,7 @@ def arenas(how: str, **variables: str) -> int:
         if name not in ("MALLOC_ARENA_MAX", "GLIBC_TUNABLES")
     }
     done = completed(
-        [sys.executable, "-c", PROGRAM, how], env={**environment, **variables}, timeout=30.0
+        [sys.executable, "-c", PROGRAM, how], env={**environment, **variables}, timeout=120.0
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.count("<heap nr=")

@@ -11,24 +11,25 @@ from holdfast.planning.settings import Method, PlanningSettings
 from holdfast.problems.capsule_robot import CapsuleRobot
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.decision_cost import (
+    ANY_MACHINE,
     COSTLY,
     FREE,
     TYPICAL_PROBLEM,
     CallCost,
     Cost,
-    cost_of_reaching,
-    cost_of_sensing,
+    Pricing,
     describe_cost,
 )
 from holdfast.protocol.service_limits import ServiceLimits
 
 METHODS = get_args(Method)
+price_of = ANY_MACHINE.price_of
 PEG = registry.problem_class("peg_in_hole_2d").from_settings({}, {})
 
 
 def answer(settings: PlanningSettings, **changes: Any) -> Cost:
     asked: dict[str, Any] = {"steps": 9.0, "inputs": 1.0, "begins": True, "num_bytes": 100.0}
-    return cost_of_reaching(PEG, settings).cost(**{**asked, **changes})
+    return price_of(PEG, settings).reaching.cost(**{**asked, **changes})
 
 
 def is_least(less: Cost, more: Cost) -> bool:
@@ -58,7 +59,7 @@ def test_a_costly_setting_never_lowers_the_cost_and_raises_it_somewhere(key: str
                 value = tuple(range(10 * factor))[:64]
             changed = with_key(settings, key, value)
             steps = float(changed.sensing_interval)
-            found = cost_of_sensing(PEG, changed), answer(changed, steps=steps)
+            found = price_of(PEG, changed).sensing, answer(changed, steps=steps)
             if key == "sensing_interval":
                 # A robot that senses less often has fewer forks in its rollouts, not more.
                 found = found[1], found[1]
@@ -78,9 +79,8 @@ def test_a_setting_that_is_no_factor_changes_nothing(key: str) -> None:
         settings = with_key(PlanningSettings(), "selector.method", method)
         bounds = numeric_keys()[key]
         other = 1 if bounds.is_whole else 0.5
-        assert cost_of_sensing(PEG, settings) == cost_of_sensing(
-            PEG, with_key(settings, key, other)
-        )
+        changed = with_key(settings, key, other)
+        assert price_of(PEG, settings).sensing == price_of(PEG, changed).sensing
 
 
 def test_more_sensing_actions_cost_more() -> None:
@@ -88,7 +88,7 @@ def test_more_sensing_actions_cost_more() -> None:
     many_actions.sensing_actions = tuple(map(str, range(200)))
     for method in METHODS:
         settings = with_key(PlanningSettings(), "selector.method", method)
-        few, many = (cost_of_sensing(each, settings) for each in (CapsuleRobot(), many_actions))
+        few, many = (price_of(each, settings).sensing for each in (CapsuleRobot(), many_actions))
         assert is_least(few, many)
         if method not in ("random", "fixed"):
             assert many.seconds > 10.0 * few.seconds
@@ -97,7 +97,7 @@ def test_more_sensing_actions_cost_more() -> None:
 def test_estimates_are_finite_whatever_is_set() -> None:
     limits = ServiceLimits()
     for hostile in hostile_settings():
-        cost = cost_of_sensing(PEG, hostile.settings)
+        cost = price_of(PEG, hostile.settings).sensing
         assert math.isfinite(cost.seconds), hostile
         assert math.isfinite(cost.num_bytes), hostile
         method = hostile.settings.selector.method
@@ -110,9 +110,9 @@ def test_the_defaults_are_brief() -> None:
     limits = ServiceLimits()
     for name in ("peg_in_hole_2d", "multitier_peg_in_hole_2d", "capsule_robot", "peg_in_hole_3d"):
         problem = registry.problem_class(name).from_settings({}, {})
-        assert cost_of_sensing(problem, PlanningSettings()).seconds < limits.max_brief_s
-        reaching = cost_of_reaching(problem, PlanningSettings())
-        failed_over = reaching.cost(steps=100, inputs=11, begins=True, num_bytes=500)
+        price = price_of(problem, PlanningSettings())
+        assert price.sensing.seconds < limits.max_brief_s
+        failed_over = price.reaching.cost(steps=100, inputs=11, begins=True, num_bytes=500)
         assert failed_over.seconds < limits.max_medium_s
 
 
@@ -196,7 +196,7 @@ def test_the_model_in_numbers(
     for name, value in changes.items():
         settings = with_key(settings, KEYS[name], value)
     own = getattr(problem, "own", TYPICAL_PROBLEM)
-    sensing = cost_of_sensing(problem(), settings, own, 1.5)
+    price = Pricing(1.5).price_of(problem(), settings, own)
     asked: dict[str, Any] = {"steps": 9.0, "inputs": 2.0, "begins": True, "num_bytes": 100.0}
-    reached = cost_of_reaching(problem(), settings, own, 1.5).cost(**asked)
-    assert (*sensing, *reached) == pytest.approx(expected, rel=1e-9)
+    reached = price.reaching.cost(**asked)
+    assert (*price.sensing, *reached) == pytest.approx(expected, rel=1e-9)

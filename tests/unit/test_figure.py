@@ -1,5 +1,6 @@
 """The picture of a trial."""
 
+import io
 import itertools
 from pathlib import Path
 from typing import Any
@@ -37,13 +38,12 @@ class TestFigure:
     @pytest.mark.parametrize(
         "example", ["light_dark_room", "capsule_robot", "peg_in_hole_3d", "docking"]
     )
-    def test_nothing_is_cut_off(self, tmp_path: Path, example: str) -> None:
+    def test_nothing_is_cut_off(self, example: str) -> None:
         overrides = {"simulator.max_steps": 40, "simulator.seed": 10**18}  # a long title
         overrides["particle_filter.num_particles"] = 50
         configuration = load(EXAMPLES / f"{example}.yaml", overrides=overrides)
         recorder = record_trial(configuration, trial=9_000_000)
-        trial_figure(configuration, recorder.record, tmp_path / "trial.png")
-        picture = imread(tmp_path / "trial.png")[..., :3]
+        picture = imread(io.BytesIO(trial_figure(configuration, recorder.record)))[..., :3]
         for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1]):
             assert (edge == 1.0).all()
         assert (picture < 1.0).any()
@@ -66,8 +66,7 @@ class TestFigure:
         monkeypatch.setattr(Figure, "savefig", savefig)
         configuration = load(tmp_path / "twelve.yaml")
         recorder = record_trial(configuration, trial=0)
-        trial_figure(configuration, recorder.record, tmp_path / "trial.png")
-        picture = imread(tmp_path / "trial.png")[..., :3]
+        picture = imread(io.BytesIO(trial_figure(configuration, recorder.record)))[..., :3]
         for edge in (picture[0], picture[-1], picture[:, 0], picture[:, -1]):
             assert (edge == 1.0).all()
         (figure,) = drawn
@@ -80,17 +79,15 @@ class TestFigure:
         for upper, lower in itertools.pairwise(labels):
             assert upper.y0 >= lower.y1 - 1.0
 
-    def test_it_is_the_same_whatever_the_user_has_set(self, tmp_path: Path) -> None:
+    def test_it_is_the_same_whatever_the_user_has_set(self) -> None:
         """LaTeX, which need not be installed, and the look of the user's other figures."""
         configuration = load(EXAMPLES / "capsule_robot.yaml", overrides={"simulator.max_steps": 12})
         record = record_trial(configuration, trial=0).record
-        trial_figure(configuration, record, tmp_path / "plain.png")
+        plain = trial_figure(configuration, record)
         theirs: Any = {"text.usetex": True, "font.size": 30.0, "savefig.dpi": 20}
         with mpl.rc_context(theirs):
-            trial_figure(configuration, record, tmp_path / "trial.png")
+            assert trial_figure(configuration, record) == plain
             assert mpl.rcParams["font.size"] == 30.0
-        plain, picture = ((tmp_path / name).read_bytes() for name in ("plain.png", "trial.png"))
-        assert plain == picture
 
     @pytest.mark.parametrize(
         ("method", "label"),
@@ -135,8 +132,7 @@ class TestFigure:
         )
         configuration = load(path)
         recorder = record_trial(configuration, trial=0)
-        trial_figure(configuration, recorder.record, tmp_path / "trial.png")
-        assert (tmp_path / "trial.png").read_bytes().startswith(b"\x89PNG\r\n")
+        assert trial_figure(configuration, recorder.record).startswith(b"\x89PNG\r\n")
 
     @pytest.mark.parametrize(
         "points",

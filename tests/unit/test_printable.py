@@ -48,8 +48,9 @@ def test_a_long_value_is_cut_between_words(value: object, shown: str) -> None:
 
 def test_what_a_peer_says_is_one_line() -> None:
     """Wherever it goes: a note, an error, the log of a robot or of ROS."""
-    refused = decode_reply(encode(Refused(1, FORGED[:40], FORGED)))
+    refused = decode_reply(encode(Refused(1, 13 * FORGED[-3:], 60 * FORGED)))
     assert isinstance(refused, Refused)
+    assert decode_reply(encode(refused)) == refused  # as long as before it was escaped
     goodbye = read_goodbye(FORGED.encode())
     line = text_line(0, "robot", FORGED, {FORGED: FORGED, "reason": FORGED, "list": [FORGED]})
     as_json = json_line(0, "robot", FORGED, {FORGED: FORGED, "list": [FORGED]})

@@ -64,8 +64,7 @@ class TestRunRecordedTrial:
             assert np.array_equal(seen.after.belief.states, known.after.belief.states)
         assert record.true_states == []
         assert record.rewards[:-1] == expected.rewards[:-1]
-        trial_figure(configuration, record, tmp_path / "trial.png")
-        assert (tmp_path / "trial.png").read_bytes().startswith(b"\x89PNG\r\n")
+        assert trial_figure(configuration, record).startswith(b"\x89PNG\r\n")
 
     def test_a_failure_is_one_again(self, tmp_path: Path) -> None:
         configuration = configuration_of(tmp_path)

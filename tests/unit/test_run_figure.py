@@ -49,9 +49,15 @@ def test_the_figure_of_any_trial_in_three_formats(
     ):
         said = workplace.run("export", "out", *words, figures="new.png" not in words)
         assert (said.code, message in said.stderr) == (2, True), said.stderr
-    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(errno.ENOSPC, "No space left")))
-    said = workplace.run("export", "out", "--figure", "new.pdf", figures=True)
-    assert "error: new.pdf: cannot be written: No space left" in said.stderr
+    full = OSError(errno.ENOSPC, "No space left")
+    for more, synchronized, name in (
+        ([], [full], "new.pdf"),
+        (["--csv", "tables"], [None, full], "tables"),  # no part of an export is put in place alone
+    ):
+        monkeypatch.setattr(os, "fsync", Mock(side_effect=synchronized))
+        said = workplace.run("export", "out", "--figure", "new.pdf", *more, figures=True)
+        assert f"error: {name}: cannot be written: No space left" in said.stderr
+        assert not (workplace.directory / "new.pdf").exists()
 
 
 def test_without_matplotlib_a_note_says_so(workplace: Workplace) -> None:

@@ -16,7 +16,7 @@ from tests.unit.test_protocol_service import (
 from holdfast.planning.interruption import check
 from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.problem import Problem
-from holdfast.protocol.decision_cost import cost_of_sensing
+from holdfast.protocol.decision_cost import ANY_MACHINE
 from holdfast.protocol.messages import Busy, Refused, SessionConfiguration
 from holdfast.protocol.service_limits import ServiceLimits
 
@@ -277,7 +277,7 @@ def test_what_takes_much_longer_than_estimated_is_refused() -> None:
 
 
 def test_long_decisions_share_a_bound_on_memory() -> None:
-    one = cost_of_sensing(Robot().problem, long_planning()).num_bytes
+    one = ANY_MACHINE.price_of(Robot().problem, long_planning()).sensing.num_bytes
     bench = Bench(workers=4, max_decision_bytes=int(2.5 * one))
     ask_for_long_ones(bench, 4)
     assert len(bench.jobs) == 2, "of three threads"

@@ -20,7 +20,6 @@ from holdfast.protocol.robot_events import (
     TransportEvent,
 )
 from holdfast.transport.contract import IncomingCall
-from holdfast.transport.credentials import load_credentials
 from holdfast.transport.endpoints import TlsFiles
 from holdfast.transport.frames import (
     CALL,
@@ -361,13 +360,11 @@ def short_lived(directory: Path, seconds: float, **names: list[str]) -> None:
 
 async def test_a_robots_link_ends_when_its_certificate_expires(tmp_path: Path) -> None:
     make_credentials(tmp_path, robots=["berta"], services=["cloud"])
-    short_lived(tmp_path, 3.0, robots=["anna"])
-    load_credentials(tmp_path / "anna", "robot", warn=lambda _: None)
     cloud = Cloud(tmp_path / "cloud")
     endpoint = await cloud.start()
-    anna, berta = (Robot(tmp_path / name, endpoint) for name in ("anna", "berta"))
-    for robot in (anna, berta):
-        await robot.connected()
+    await (berta := Robot(tmp_path / "berta", endpoint)).connected()
+    short_lived(tmp_path, 6.0, robots=["anna"])
+    await (anna := Robot(tmp_path / "anna", endpoint)).connected()
     await until(lambda: bool(anna.vanished), anna.events)
     why = "refuses this end, which has a certificate that has expired"
     await until(lambda: why in anna.refusals, anna.refusals)
@@ -380,7 +377,7 @@ async def test_a_robots_link_ends_when_its_certificate_expires(tmp_path: Path) -
 
 async def test_a_robot_leaves_a_service_whose_certificate_expires(tmp_path: Path) -> None:
     make_credentials(tmp_path, robots=["anna"])
-    short_lived(tmp_path, 3.0, services=["cloud"])
+    short_lived(tmp_path, 6.0, services=["cloud"])
     cloud = Cloud(tmp_path / "cloud")
     anna = Robot(tmp_path / "anna", await cloud.start())
     await anna.connected()

@@ -209,7 +209,11 @@ def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions)
         if options.figure is not None:
             from holdfast.reports.figure import trial_figure
 
-            trial_figure(recorded.configuration, first.record, options.figure)
+            kind = options.figure.suffix[1:].lower()
+            picture = trial_figure(recorded.configuration, first.record, kind)
+            file = stack.enter_context(directory_beside(options.figure)) / "figure"
+            file.write_bytes(picture)
+            made.append((file, options.figure))
         for here, there in made:
             move_into_place(here, there)
     return notes

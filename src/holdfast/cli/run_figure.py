@@ -78,6 +78,7 @@ def _drawn(
     except HoldfastError as error:
         return Remark(f"no figure, because {error}")
     from holdfast.reports.figure import trial_figure
+    from holdfast.runtime.files import write_atomically
 
     if recorder.record.result is None:
         kept = msgspec.structs.replace(result, decisions=directory.journal.decisions(trial))
@@ -90,7 +91,7 @@ def _drawn(
         except DecidedOtherwiseError as error:
             return _remark_on(error, configuration, directory)
         recorder.record.result = result  # it alone has the reward of the last step
-    trial_figure(configuration, recorder.record, path)
+    write_atomically(path, trial_figure(configuration, recorder.record))
     return None
 
 

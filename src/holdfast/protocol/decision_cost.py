@@ -141,8 +141,8 @@ class Pricing(NamedTuple):
     ) -> Price:
         """Return what decisions cost; ``known`` is what the problem does, if it was measured."""
         own = known or (TYPICAL_PROBLEM if self.measure is None else self.measure(problem))
-        sensing = cost_of_sensing(problem, planning, own, self.slowness)
-        return Price(own, sensing, cost_of_reaching(problem, planning, own, self.slowness))
+        sizes = _Sizes(problem, planning, own, self.slowness)
+        return Price(own, _cost_of_sensing(sizes), _cost_of_reaching(sizes))
 
 
 ANY_MACHINE = Pricing()
@@ -288,14 +288,9 @@ class _Sizes:
         return 8.0 * batch * particles + kept + 2.0 * _GROUP_BYTES * together
 
 
-def cost_of_sensing(
-    problem: Problem,
-    planning: PlanningSettings,
-    own: ProblemCost = TYPICAL_PROBLEM,
-    slowness: float = 1.0,
-) -> Cost:
+def _cost_of_sensing(sizes: _Sizes) -> Cost:
     """Return the most that the choice of a sensing action takes."""
-    sizes = _Sizes(problem, planning, own, slowness)
+    planning, own = sizes.planning, sizes.own
     method = planning.selector.method
     if method in UNINFORMED_METHODS:
         return Cost(2.0 * _PYTHON * sizes.unit_s, sizes.state_bytes)
@@ -314,7 +309,7 @@ def cost_of_sensing(
         sets = float(len(offsets))
         seconds += _path_s(sizes, float(max(offsets, default=0)))
         num_bytes += sets * sizes.particles * 8.0 * (2.0 * sizes.coordinates + 4.0 * dimension + 2)
-    if method in ENTROPY_METHODS and len(getattr(problem, "circular_actions", ())):
+    if method in ENTROPY_METHODS and len(getattr(sizes.problem, "circular_actions", ())):
         seconds += sets * sizes.particles * dimension * 150.0 * sizes.unit_s
     seconds += own.act.of(sets * sizes.particles)
     seconds += sizes.entropies_s(posteriors, sets, dimension)
@@ -397,19 +392,13 @@ def _expected_return(sizes: _Sizes) -> Cost:
     return Cost(seconds, num_bytes)
 
 
-def cost_of_reaching(
-    problem: Problem,
-    planning: PlanningSettings,
-    own: ProblemCost = TYPICAL_PROBLEM,
-    slowness: float = 1.0,
-) -> Reaching:
+def _cost_of_reaching(sizes: _Sizes) -> Reaching:
     """Return what it takes to reach the states of a session."""
-    sizes = _Sizes(problem, planning, own, slowness)
-    particles, size = sizes.particles, float(own.observation_size)
+    own, particles, size = sizes.own, sizes.particles, float(sizes.own.observation_size)
     # Likelihood, gate and resampling.
     number = 30.0 + 10.0 * size + 6.0 * size * size + 6.0 * sizes.coordinates
     fold_s = (2.0 * _PYTHON + particles * number) * sizes.unit_s + own.sense.of(particles)
-    if sizes.general and getattr(problem, "rank_test", False):
+    if sizes.general and getattr(sizes.problem, "rank_test", False):
         fold_s += 19.0 * (own.sense.of(particles) + 20.0 * particles * sizes.unit_s)
     return Reaching(
         Cost(

@@ -26,7 +26,7 @@ import msgspec
 from holdfast.errors import MessageError
 from holdfast.planning.inputs import MAX_INPUTS, CatchUpInput, Moved, Sensed
 from holdfast.planning.settings import PlanningSettings
-from holdfast.printable import one_line
+from holdfast.printable import cut, one_line
 from holdfast.protocol.plain_data import check_plain_data
 
 PROTOCOL_VERSION = 6
@@ -44,8 +44,8 @@ MAX_ACTION_SIZE = 4096
 MAX_WORD = 2**32 - 1
 """Largest integer in a message."""
 
-MAX_TEXT = 4000
-"""Bound on the characters of a refusal's text."""
+MAX_CODE, MAX_TEXT = 40, 4000
+"""Bounds on the characters of a refusal's code and text."""
 
 MAX_CONFIGURATION_BYTES = 256 * 1024
 """Bound on a session configuration, encoded."""
@@ -215,7 +215,7 @@ class Refused(msgspec.Struct, array_like=True, frozen=True, tag=6):
     # ``stale_epoch``, ``unknown_problem``, ``other_code`` (the service's holdfast or problem is not
     # the robot's), ``invalid`` (settings or state out of bounds), ``out_of_memory`` (it may be
     # asked again) or ``failed`` (the problem's own functions failed in this state).
-    code: Annotated[str, msgspec.Meta(max_length=40)]
+    code: Annotated[str, msgspec.Meta(max_length=MAX_CODE)]
     text: Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
 
 
@@ -358,7 +358,8 @@ def decode_reply(payload: bytes) -> Reply:
         raise MessageError("malformed", f"{len(payload)} bytes are no reply: {error}") from error
     if isinstance(reply, Refused):
         # A peer's words go into logs and messages, where a line of theirs would look like ours.
-        return Refused(reply.number, one_line(reply.code), one_line(reply.text))
+        code, text = cut(one_line(reply.code), MAX_CODE), cut(one_line(reply.text), MAX_TEXT)
+        return Refused(reply.number, code, text)
     return reply
 
 

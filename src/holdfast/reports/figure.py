@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from pathlib import Path
 from textwrap import fill
 from typing import Any
 
@@ -40,7 +39,6 @@ from holdfast.reports.facts import SCORES
 from holdfast.reports.recorder import TrialRecord
 from holdfast.reports.scene_drawing import obstacles_within, outline, shown_part, walls_at
 from holdfast.robot.trial import SensingStep
-from holdfast.runtime.files import write_atomically
 
 _TRUE = "#111111"
 _BELIEF = "#2F6DB3"
@@ -103,11 +101,8 @@ STYLE: Any = {
 
 
 @in_own_mode
-def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) -> None:
-    """Draw a trial and write the picture; the name of the file says whether as PNG, PDF or SVG.
-
-    Raises OutputError if it cannot be written.
-    """
+def trial_figure(configuration: Configuration, record: TrialRecord, kind: str = "png") -> bytes:
+    """Draw a trial; return the picture as a file of this kind: ``png``, ``pdf`` or ``svg``."""
     problem = configuration.problem
     scene: Scene | None = checked.scene(problem)
     num_panels = problem.state_size + 2
@@ -143,11 +138,10 @@ def trial_figure(configuration: Configuration, record: TrialRecord, path: Path) 
         panels[-1].set_xlabel("step")
         panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
         picture = io.BytesIO()
-        kind = path.suffix.lower().removeprefix(".")
         # The same trial gives the same file, whenever it is drawn.
         undated = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(kind)
         figure.savefig(picture, format=kind, dpi=_DOTS_PER_INCH, metadata=undated)
-    write_atomically(path, picture.getvalue())
+    return picture.getvalue()
 
 
 def _title(configuration: Configuration, record: TrialRecord) -> str:
