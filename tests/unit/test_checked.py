@@ -84,6 +84,7 @@ def huge(value: float) -> np.ndarray:
         ("observation_mean", lambda *_: np.zeros(1), "of sensing action 0 .* float64 of shape"),
         ("observation_variance", lambda *_: 0.01, r"action 0 of line .* float \(0.01\): need"),
         ("observation_variance", lambda *_: np.ones(2), r"float64 of shape \(2,\)"),
+        ("observation_variance", lambda *_: np.ones(1, complex), r"complex128 of shape \(1,\)"),
         ("policy", lambda s, _: -s, r"float64 of shape \(30, 2\): need .* \(30, 1\)"),
         ("policy", lambda s, _: [[0.0]] * len(s), "policy of line returned list"),
         ("move", lambda *_: None, "move of line returned NoneType"),

@@ -46,7 +46,8 @@ def prediction(
     ``(observation_size,)``. Whether they are finite is left to :func:`require_usable`.
     """
     mean = _mean(problem, states, sensing_action).copy()
-    return mean, _variance(problem, states, sensing_action, mean.shape).copy()
+    variance = _variance(problem, states, sensing_action, mean.shape)
+    return mean, variance.astype(np.float64, order="C")
 
 
 def predictions(
@@ -94,7 +95,7 @@ def _variance(
     variance: FloatArray = as_caller(problem.observation_variance, states, sensing_action)
     one = shape[-1:]
     fits = isinstance(variance, np.ndarray) and variance.shape in (one, shape)
-    if not fits or is_masked(variance):
+    if not fits or variance.dtype.kind not in "biuf" or is_masked(variance):
         need = one if len(shape) == 1 else f"{one} or {shape}"
         what = f"observation_variance of sensing action {sensing_action}"
         raise _misfit(problem, what, variance, need)
