@@ -233,10 +233,11 @@ class RegionRobot:
 
     def waits_since(self) -> float:
         """Return since when the robot stands still for a decision; infinity if it does not."""
-        question = self._machine._source.question
-        if question is None or question.complete or question.needed_at is None:
+        source = self._machine._source
+        question, needed_at = source.question, source.needed_at
+        if question is None or question.complete or needed_at is None:
             return math.inf
-        return question.needed_at
+        return needed_at
 
     def hear(self, event: Any) -> None:
         """Take what has come over the wire."""

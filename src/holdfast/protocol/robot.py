@@ -416,7 +416,7 @@ class Robot:
             question = self._ask(self._planner.digest(state), now)
         answer = question.sensing
         if answer is None:
-            self._await_answer(now)
+            self._source.await_answer(now)
             return
         if (
             question.state is not state
@@ -426,7 +426,7 @@ class Robot:
             self._effects.report("prefetch_unused", trial=self._trial, step=state.step)
             self._source.recompute()
             self._ask(self._planner.digest(state), now)
-            self._await_answer(now)
+            self._source.await_answer(now)
             return
         provenance = question.sensing_provenance
         assert provenance is not None
@@ -449,28 +449,26 @@ class Robot:
             offset = 0
             if self._source.stopped_by is not None:
                 return
-        actions = question.task_actions
-        if actions is None:
-            self._await_answer(now)
+        actions, provenance = question.task_actions, question.task_provenance
+        if actions is None or provenance is None:
+            self._source.await_answer(now)
             return
         if offset == len(actions):
             try:
-                actions.append(self._planner.choose_task_action(state)[0])
+                own = self._planner.choose_task_action(state)[0]
             except HoldfastError as error:
                 self._source.stop(error)
                 return
-        provenance = question.task_provenance
-        if offset == 0 and provenance is not None and provenance is not self._timed_provenance:
+            question.follow_tasks([*actions, own], provenance)
+        if offset == 0 and provenance is not self._timed_provenance:
             self._timed_provenance = provenance
             self._timed("task", question, provenance, now)
-        question.needed_at = None
         if not self._take_tick(now):
             return
-        action = actions[offset]
+        action = question.order(offset)
         self._write(ActingRecord(state.step, encode_floats(action)))
         history = self._current_history
         history.pending = action
-        question.num_ordered = offset + 1
         self._awaits_environment = True
         self._effects.append(Act(state.step, action))
 
@@ -491,17 +489,8 @@ class Robot:
             history.num_inputs,
             self._source.takes_tasks,
         )
-        if not question.takes_tasks or question.task_count == 0:
-            question.needed_at = now
         self._source.ask(question, now)
         return question
-
-    def _await_answer(self, now: float) -> None:
-        """Wait for the rest of the answer."""
-        question = self._source.question
-        if question is not None and question.needed_at is None:
-            question.needed_at = now
-            self._source.wake(now)
 
     def _take_tick(self, now: float) -> bool:
         """Return whether the next task action is due, and take its tick; else set the wakeup."""
@@ -563,7 +552,6 @@ class Robot:
 
     def _timed(self, kind: str, question: Question, provenance: Provenance, now: float) -> None:
         self.has_decided = True
-        waited_s = 0.0 if question.needed_at is None else now - question.needed_at
         step = question.state.step if kind == "task" else question.sensing_step
         self._effects.append(
             Timing(
@@ -572,7 +560,7 @@ class Robot:
                 kind,
                 provenance.service,
                 self._source.tracker.status.value,
-                1e3 * waited_s,
+                1e3 * self._source.end_wait(now),
                 1e3 * provenance.round_trip_s,
                 1e3 * provenance.computed_s,
             )
