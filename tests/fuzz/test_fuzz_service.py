@@ -236,11 +236,12 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     for task in tasks:
         assert task.request is None or task.request.session_configuration is None
     # Calls: each waits for one work that is still to be done.
-    attached = [record for task in tasks for record in task.calls.values()]
+    attached = [record for waiting in calls._of.values() for record in waiting.values()]
+    assert set(calls._of) <= set(tasks)
     assert len(attached) == len(calls) == statistics.calls
     assert all(calls._calls[record.call] is record for record in attached)
     most = 2 * limits["max_calls_per_request"]
-    assert all(len(task.calls) <= most for task in tasks)
+    assert all(0 < len(waiting) <= most for waiting in calls._of.values())
     assert set(calls._calls) == set(bench.replies) - bench.ended
     # Problems.
     pool = service._problems._idle

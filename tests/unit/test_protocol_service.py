@@ -811,7 +811,7 @@ def runs_of(service: Service, call: int, request: Request, now: float) -> list[f
     service.receive(call, request, len(encode(request)), now)
     while runs := [each for each in service.next_jobs(now) if isinstance(each, StartJob)]:
         (run,) = runs
-        expected.append(run.expected_s)
+        expected.append(run.job.expected_s)
         service.started(run.job, now)
         now += 0.001
         service.finished(run.job, run.job.run(), now)

@@ -58,7 +58,8 @@ class TestRequestQueue:
         return task.digest, job
 
     def finish(self, job: Job) -> None:
-        self.queue.release_held(self.queue.end(job).session)
+        task, _ = self.queue.end(job)
+        self.queue.release_held(task.session)
 
     def test_those_that_robots_stand_still_for_go_first(self) -> None:
         self.task(self.session(1), b"ahead", 0.0, prefetched=True)
@@ -267,7 +268,7 @@ class TestTheWait:
         self.queue.started(job, 1.5)
         assert self.wait_s(1.51) == pytest.approx(0.04 / 4)
         assert self.wait_s(9.0) == 0.0  # longer than was expected
-        assert self.queue.end(job) is task
+        assert self.queue.end(job) == (task, 1.5)
         assert [*running, task.running] == [True, False]
         assert (len(self.queue.running), self.wait_s(1.5)) == (0, 0.0)
 

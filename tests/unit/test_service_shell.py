@@ -407,13 +407,14 @@ class Scripted:
     is_like = Job.is_like
     company = None
 
-    def __init__(self, kind: str, run: Callable[[], object]) -> None:
+    def __init__(self, kind: str, expected_s: float, run: Callable[[], object]) -> None:
         self.kind = kind
+        self.expected_s = expected_s
         self.run = run
 
 
 def scripted(*jobs: tuple[str, float, Callable[[], object]]) -> tuple[Script, ServiceShell]:
-    machine = Script(*(StartJob(cast(Job, Scripted(kind, run)), s, True) for kind, s, run in jobs))
+    machine = Script(*(StartJob(cast(Job, Scripted(*job)), True) for job in jobs))
     return machine, ServiceShell(
         machine, InProcessNetwork().service("service", "boot"), RecordingSink()
     )

@@ -119,9 +119,13 @@ class Job:
         building_counts: bool = False,
         # The same for jobs of the same problem and settings; None: like no other.
         company: bytes | None = None,
+        # How long a short job takes; infinite for one that takes long or that nothing predicts: the
+        # first job, a problem that is not built in, or an unusual request.
+        expected_s: float = math.inf,
     ) -> None:
         self.kind = kind
         self.company = company
+        self.expected_s = expected_s
         self._pricing = pricing
         self.price = price
         self._known = known
@@ -442,9 +446,6 @@ class StartJob(NamedTuple):
     """
 
     job: Job
-    # Time of a short job; infinite for one that takes long or that nothing predicts: the first job,
-    # a problem that is not built in, or an unusual request.
-    expected_s: float
     # Whether its lane ends it after a moment. All others may take any time, so their threads have
     # less weight (:class:`~holdfast.protocol.service_lanes.Lanes`).
     is_brief: bool

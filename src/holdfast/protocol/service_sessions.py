@@ -8,8 +8,8 @@ A session belongs to an *owner*: the name in the robot's verified certificate, N
 without one. Sessions are found by owner and session id together, so the same id from another owner
 is another session, and nothing is revealed. If room is short, the largest owners lose sessions.
 
-A session also lists its pending tasks: parts of answers that wait or run, with their waiting
-calls. A part is identified by the digest of its state, so equal questions share one task.
+A session also lists its pending tasks: parts of answers that wait or run. A part is identified by
+the digest of its state, so equal questions share one task.
 """
 
 from __future__ import annotations
@@ -74,23 +74,8 @@ class CachedAnswer(NamedTuple):
     sensing_action: int = -1
 
 
-class WaitingCall:
-    """A call (one request of a robot) that waits for a task, and when it got its last reply."""
-
-    def __init__(self, call: int, number: int, task: PendingTask, last_sign_at: float) -> None:
-        self.call = call
-        self.number = number
-        self.task = task
-        self.last_sign_at = last_sign_at
-
-
 class PendingTask:
-    """A part of an answer to be computed, and the calls that wait for it.
-
-    The service creates and drops tasks; :class:`RequestQueue` writes ``urgent``, ``running`` and
-    ``started_at``, and has a waiting task carry a newer request; :class:`WaitingCalls` writes
-    ``calls``.
-    """
+    """A part of an answer to be computed; only the lanes, where it waits and runs, write it."""
 
     def __init__(
         self,
@@ -114,14 +99,11 @@ class PendingTask:
         self.since = since
         self.slot = PREFETCHED if request is None else REQUESTED
         self.urgent = request is not None
-        self.calls: dict[int, WaitingCall] = {}
         # Where it waits and runs (:mod:`~holdfast.protocol.service_lanes`).
         self.lane = session.lane_of(request)
         self.num_bytes = 0.0  # estimated memory, unless it is brief
         self.cost_s = self._expected_s()
         self.running = False
-        self.short_s = math.inf  # how long a short one is expected to run
-        self.started_at = since
 
     @property
     def kind(self) -> Literal["task", "sensing"]:

@@ -346,7 +346,7 @@ class ServiceShell:
 
     def _run(self, run: StartJob) -> None:
         job = run.job
-        if run.expected_s == math.inf:
+        if job.expected_s == math.inf:
             pool = self._brief if run.is_brief else self._others
             pool.submit(
                 functools.partial(self._computed, job),

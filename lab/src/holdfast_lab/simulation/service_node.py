@@ -153,7 +153,7 @@ class ServiceNode:
         if cost_s > most_s:
             job.interruption.use_up()
         took_s, waits_s = min(cost_s, most_s), 0.0
-        if run.expected_s < math.inf:
+        if job.expected_s < math.inf:
             waits_s = max(0.0, self._short_ones_end_at - queue.now)
             self._short_ones_end_at = queue.now + waits_s + took_s
         queue.after(waits_s + took_s, self._finish, self._memory, job, took_s)
