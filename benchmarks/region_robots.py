@@ -46,7 +46,7 @@ from holdfast.protocol.robot_events import (
     Timing,
 )
 from holdfast.protocol.service import Service
-from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
+from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast_lab.simulation.checked_memo import CheckedPlanner, JobCache
 from holdfast_lab.simulation.environment_model import EnvironmentModel
@@ -136,8 +136,8 @@ class MachineShell:
                 self._reply(effect.call, effect.payload)
             elif isinstance(effect, EndCall):
                 self._end(effect.call)
-            elif isinstance(effect, StartJob):
-                self._begin(effect.job)
+            elif isinstance(effect, Job):
+                self._begin(effect)
         due = self.machine.next_wakeup()
         if due is not None and due < self._wakes_at:
             self._wakes_at = due

@@ -13,7 +13,7 @@ from holdfast.problems.problem import Problem
 from holdfast.protocol.computing_time import ExpectedTime
 from holdfast.protocol.messages import Request, SessionConfiguration, encode
 from holdfast.protocol.service import Service
-from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
+from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast.protocol.service_sessions import (
     CachedAnswer,
@@ -137,8 +137,8 @@ class _Split:
 
     def _apply(self, owner: str | None, effects: list[ServiceEffect]) -> None:
         for effect in (*effects, *self.service.next_jobs(0.0)):
-            if isinstance(effect, StartJob):
-                self.jobs[owner].append(effect.job)
+            if isinstance(effect, Job):
+                self.jobs[owner].append(effect)
             elif isinstance(effect, SendReply | EndCall):
                 whose, number = self._calls[effect.call]
                 assert whose == owner, "what one owner does tells another something"

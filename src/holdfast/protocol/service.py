@@ -43,7 +43,6 @@ from holdfast.protocol.service_jobs import (
     JobResult,
     ProblemPool,
     ServiceEffect,
-    StartJob,
 )
 from holdfast.protocol.service_lanes import Lanes
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
@@ -473,9 +472,10 @@ class Service:
             building_counts=task.lane != LONG,
             company=session.company,
             expected_s=expected_s,
+            is_brief=task.lane <= BRIEF,
         )
         self._queue[task.lane].handed_out(task, job, now)
-        self._effects.append(StartJob(job, task.lane <= BRIEF))
+        self._effects.append(job)
 
     # -- outcomes --------------------------------------------------------------------------------
 

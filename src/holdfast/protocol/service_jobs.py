@@ -92,7 +92,11 @@ class _LacksStateError(Exception):
 
 
 class Job:
-    """A part of an answer to be computed."""
+    """A part of an answer to be computed anywhere; its result is handed to ``Service.finished``.
+
+    Short jobs are run one after another, or together
+    (:func:`~holdfast.protocol.service_batches.run_together`): they share their problem.
+    """
 
     def __init__(
         self,
@@ -122,10 +126,14 @@ class Job:
         # How long a short job takes; infinite for one that takes long or that nothing predicts: the
         # first job, a problem that is not built in, or an unusual request.
         expected_s: float = math.inf,
+        # Whether its lane ends it after a moment. All others may take any time, so their threads
+        # have less weight (:class:`~holdfast.protocol.service_lanes.Lanes`).
+        is_brief: bool = False,
     ) -> None:
         self.kind = kind
         self.company = company
         self.expected_s = expected_s
+        self.is_brief = is_brief
         self._pricing = pricing
         self.price = price
         self._known = known
@@ -438,19 +446,6 @@ class EndCall(NamedTuple):
     call: int
 
 
-class StartJob(NamedTuple):
-    """Run a job anywhere, and hand its result to the machine's ``finished``.
-
-    Short jobs are run one after another, or together
-    (:func:`~holdfast.protocol.service_batches.run_together`): they share their problem.
-    """
-
-    job: Job
-    # Whether its lane ends it after a moment. All others may take any time, so their threads have
-    # less weight (:class:`~holdfast.protocol.service_lanes.Lanes`).
-    is_brief: bool
-
-
 class Computed(NamedTuple):
     """Time that a part of an answer took; for metrics only."""
 
@@ -459,4 +454,4 @@ class Computed(NamedTuple):
     waited_s: float  # before it was begun
 
 
-ServiceEffect: TypeAlias = SendReply | EndCall | StartJob | Computed | LogEvent
+ServiceEffect: TypeAlias = SendReply | EndCall | Job | Computed | LogEvent

@@ -7,7 +7,7 @@ the next job, and it has sent all replies. Long jobs, which compute without the 
 large requests go to threads; their results return to the loop.
 
 A brief job cannot be interrupted, so a job counts as brief only if those before it of the same
-robot were, and if it is as usual (:class:`~holdfast.protocol.service_jobs.StartJob`).
+robot were, and if it is as usual (:class:`~holdfast.protocol.service_jobs.Job`).
 
 What a peer sends may lead to any exception, and none ends the process. Decoding and jobs touch
 nothing that is shared, so an exception there refuses that request alone. One in the machine, also
@@ -44,7 +44,6 @@ from holdfast.protocol.service_jobs import (
     JobResult,
     SendReply,
     ServiceEffect,
-    StartJob,
 )
 from holdfast.protocol.service_limits import ServiceStatistics
 from holdfast.runtime.events import EventRates, EventSink
@@ -332,7 +331,7 @@ class ServiceShell:
                 self._has_replied |= not is_last
             elif isinstance(effect, EndCall):
                 self._calls.pop(effect.call).end()
-            elif isinstance(effect, StartJob):
+            elif isinstance(effect, Job):
                 self._run(effect)
             elif isinstance(effect, LogEvent):
                 self.note(effect.name, **effect.fields)
@@ -344,10 +343,9 @@ class ServiceShell:
             self._idle.set_result(None)
             self._idle = None
 
-    def _run(self, run: StartJob) -> None:
-        job = run.job
+    def _run(self, job: Job) -> None:
         if job.expected_s == math.inf:
-            pool = self._brief if run.is_brief else self._others
+            pool = self._brief if job.is_brief else self._others
             pool.submit(
                 functools.partial(self._computed, job),
                 lambda computed: self._guarded(self._finished, job, *computed),
