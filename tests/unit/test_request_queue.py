@@ -25,8 +25,7 @@ class TestRequestQueue:
             (None, request.session),
             request,
             robot.session_configuration,
-            ExpectedTime(0.001),
-            ExpectedTime(0.001),
+            (ExpectedTime(0.001), ExpectedTime(0.001)),
         )
 
     def task(self, session: Session, name: bytes, since: float, *, prefetched: bool) -> PendingTask:
@@ -135,8 +134,7 @@ def made(
         (owner, request.session),
         request,
         robot.session_configuration,
-        ExpectedTime(0.05),
-        ExpectedTime(0.05),
+        (ExpectedTime(0.05), ExpectedTime(0.05)),
     )
     return PendingTask(
         session,

@@ -221,8 +221,7 @@ def session_of(number: int, owner: str | None = "anna") -> Session:
         (owner, request.session),
         request,
         robot.session_configuration,
-        ExpectedTime(),
-        ExpectedTime(),
+        (ExpectedTime(), ExpectedTime()),
     )
 
 
@@ -415,8 +414,8 @@ def test_the_nearest_state_before_a_request() -> None:
 def test_which_tasks_earlier_times_predict() -> None:
     session = session_of(1)
     session.built_in = session.served = True
-    session.task_time.learn(0.001)
-    session.sensing_time.learn(0.001)
+    for time in session.times:
+        time.learn(0.001)
     interval = session.planning.sensing_interval
     robot = Robot(key=1)
     robot.sense()

@@ -108,9 +108,8 @@ class Service:
         self._calls = WaitingCalls(self._limits, self._statistics, self._effects)
         # Of results whose replies are on their way first.
         self._settling: list[Session] = []
-        # Of all robots; each session has its own, which begin here.
-        self._task_time = ExpectedTime(1e-3)
-        self._sensing_time = ExpectedTime(1e-3)
+        # Of all robots' task and sensing parts; each session has its own, which begin here.
+        self._times = ExpectedTime(1e-3), ExpectedTime(1e-3)
 
     @property
     def max_running(self) -> int:
@@ -186,13 +185,14 @@ class Service:
                 session.overran = session.overran and computed_s > self._queue.limits_s[MEDIUM]
                 if outcome.restored:
                     # A particle in an obstacle, say, takes a thousand times as long to move.
-                    session.task_time.expect_long()
+                    session.times[False].expect_long()
                 if typical and task.lane <= BRIEF:
                     # What new robots are expected to take.
-                    (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
+                    self._times[task.sensing].learn(computed_s)
                 if typical or outcome.restored:
                     task.expected_time.learn(computed_s, processor_s)
-                    self._sessions.alike(session).learn(task.sensing, computed_s, processor_s)
+                    common = self._sessions.alike(session).times[task.sensing]
+                    common.learn(computed_s, processor_s)
                 self._succeeded(task, outcome, started_at, now)
             self._settling.append(session)
         return self._effects.take()
@@ -292,13 +292,9 @@ class Service:
             )
             self._calls.send_refused(call, request.number, "invalid", text)
             return None
-        session = Session(
-            key,
-            request,
-            configuration,
-            ExpectedTime(self._task_time.mean_s, _INERTIA_OF_ONE),
-            ExpectedTime(self._sensing_time.mean_s, _INERTIA_OF_ONE),
-        )
+        task_s, sensing_s = (time.mean_s for time in self._times)
+        times = ExpectedTime(task_s, _INERTIA_OF_ONE), ExpectedTime(sensing_s, _INERTIA_OF_ONE)
+        session = Session(key, request, configuration, times)
         session.known = self._problems.cost_of(session.owner, session.problem_key)
         self._sessions.alike(session).share_with(session)
         lane = session.lane_of(request)

@@ -113,14 +113,14 @@ class PendingTask:
     @property
     def expected_time(self) -> ExpectedTime:
         """Learned from earlier ones of its session and kind."""
-        return self.session.sensing_time if self.sensing else self.session.task_time
+        return self.session.times[self.sensing]
 
     def _expected_s(self) -> float:
         """Return how long it may take, with the sensing part that follows a task part."""
-        session = self.session
-        mean_s = session.sensing_time.mean_s + (0.0 if self.sensing else session.task_time.mean_s)
+        task_time, sensing_time = self.session.times
+        mean_s = sensing_time.mean_s + (0.0 if self.sensing else task_time.mean_s)
         # One that may be too long for its lane is only estimated there.
-        is_computed = self.lane > BRIEF or session.is_brief
+        is_computed = self.lane > BRIEF or self.session.is_brief
         return mean_s if is_computed else _ESTIMATING_S
 
     def move_to(self, lane: int, cost: Cost) -> None:
@@ -172,18 +172,14 @@ class Alike:
     def __init__(self, session: Session) -> None:
         self.planning = session.planning
         self.single_core = session.single_core
-        # How long their decisions take, whoever's they are.
-        self._task_time, self._sensing_time = ExpectedTime(), ExpectedTime()
-
-    def learn(self, sensing: bool, computed_s: float, processor_s: float | None) -> None:
-        """Include the time of one decision."""
-        (self._sensing_time if sensing else self._task_time).learn(computed_s, processor_s)
+        # How long their task and sensing parts take, whoever's they are.
+        self.times = ExpectedTime(), ExpectedTime()
 
     def share_with(self, session: Session) -> None:
         """Give a new session what is known: the same objects need no further check."""
         session.planning, session.single_core = self.planning, self.single_core
-        session.task_time.typical_s = self._task_time.typical_s
-        session.sensing_time.typical_s = self._sensing_time.typical_s
+        for time, common in zip(session.times, self.times, strict=True):
+            time.typical_s = common.typical_s
 
 
 class Session:
@@ -199,8 +195,7 @@ class Session:
         key: SessionKey,
         request: Request,
         configuration: SessionConfiguration,
-        task_time: ExpectedTime,
-        sensing_time: ExpectedTime,
+        times: tuple[ExpectedTime, ExpectedTime],  # of its task and sensing parts
     ) -> None:
         self.key = key
         self.owner = key[0]
@@ -247,8 +242,7 @@ class Session:
         # the digest of their state.
         self.answers: OrderedDict[bytes, CachedAnswer] = OrderedDict()
         self.pending: dict[bytes, PendingTask] = {}
-        self.task_time = task_time
-        self.sensing_time = sensing_time
+        self.times = times
         self.num_bytes = 0  # counted size of states and answers
         self.used_at = 0.0  # time of the last request or result
         self.closed = False
