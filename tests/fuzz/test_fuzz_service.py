@@ -219,16 +219,13 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     assert statistics.running == len(running) == len(bench.jobs)
     fewer = max(1, bench.workers - 1)
     most = {NEW: fewer, FIRST: fewer, BRIEF: bench.workers, MEDIUM: fewer, LONG: fewer}
+    assert statistics.waiting == len(waiting)
     for number, lane in enumerate(lanes):
         # Short ones run together with others.
         assert sum(job.expected_s == math.inf for job in lane.running) <= most[number]
-    assert statistics.waiting == len(waiting)
-    for lane in lanes:
-        check_lane(lane, [task for task in waiting if queue[task.lane] is lane])
-    for number, lane in enumerate(lanes):
-        requested = [
-            task for task in waiting if task.request is not None and queue[task.lane] is lane
-        ]
+        in_lane = [task for task in waiting if queue[task.lane] is lane]
+        check_lane(lane, in_lane)
+        requested = [task for task in in_lane if task.request is not None]
         room = limits["max_waiting"] if number > FIRST else (limits["max_waiting"] + 1) // 2
         # One owner finds room, if another has taken that of all.
         assert len(requested) <= max(room, 2 * bench.workers) + 2 * bench.workers

@@ -275,7 +275,8 @@ def test_what_fails_after_an_action_was_performed_leaves_it_in_the_journal() -> 
     # The effects come in this order: what is to be written down is, before the robot stops.
     resumed = begin_after(tuple(world.journal), None)
     assert resumed.stopped is None
-    assert resumed.robot.step == 6
+    state = resumed.robot.state
+    assert state is not None and state.step == 6
 
 
 class TestFailedTask:

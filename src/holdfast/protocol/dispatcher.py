@@ -137,13 +137,11 @@ class Dispatcher(DecisionSource):
 
     def handle(self, event: TransportEvent | OwnAnswer | RecoveryExited, now: float) -> None:
         """Handle an event of the transport, the own planner or the local service's process."""
-        if isinstance(event, ReplyReceived):
+        if isinstance(event, ReplyReceived | CallEnded):
             call = self._calls.get(event.call)
-            if call is not None:
+            if call is not None and isinstance(event, ReplyReceived):
                 self._replied(call, event.payload, now)
-        elif isinstance(event, CallEnded):
-            call = self._calls.get(event.call)
-            if call is not None:
+            elif call is not None:
                 self._ended(call, now)
         elif isinstance(event, ServiceAppeared):
             self._appeared(self._services.get(event.service), event.incarnation, now)
@@ -174,7 +172,7 @@ class Dispatcher(DecisionSource):
         due: list[float | None] = []
         if self._calls:
             due += [replica.detector.deadline() for replica in services]
-            due.append(self._calls.first_sent_at() + self._limit_s)
+            due += [call.sent_at + self._limit_s for call in self._calls]
         if question is not None and not question.complete:
             if not self._is_being_asked(question, self._woke_at):
                 due += [
@@ -445,7 +443,7 @@ class Dispatcher(DecisionSource):
             self._services.local is not None
             and not self.tracker.is_recovering
             and not self._services.is_starting(now)
-            and not self._services.any_reliable()
+            and not any(replica.reliable for replica in self._services.cloud)
         ):
             self._lose_cloud(now)
             self._tend_recovery(now)

@@ -165,10 +165,6 @@ class OpenRequests:
         probes = [call.sent_at for call in self.to(replica) if not call.answered]
         return max(replica.retry_at, max(probes, default=-1e9) + self._detection_timeout_s)
 
-    def first_sent_at(self) -> float:
-        """Return when the oldest open request was sent."""
-        return next(iter(self._open.values())).sent_at
-
     def settle(self, call: OpenRequest) -> None:
         """Close a request from which nothing is awaited."""
         if self._open.pop(call.call_number, None) is not None:

@@ -123,11 +123,6 @@ class Robot:
         return None if self._history is None else self._trial
 
     @property
-    def step(self) -> int | None:
-        """The current step; None between trials."""
-        return None if self._history is None else self._history.state.step
-
-    @property
     def state(self) -> PlanningState | None:
         """The current state; None between trials."""
         return None if self._history is None else self._history.state

@@ -170,11 +170,6 @@ class Job:
         """Return whether another job asks the same of the same problem and settings."""
         return self.company is not None and (self.kind, self.company) == (other.kind, other.company)
 
-    @property
-    def is_cancelled(self) -> bool:
-        """Whether it is to end."""
-        return self.interruption.is_set
-
     def cancel(self) -> None:
         """End it as soon as it can be; from any thread."""
         self.interruption.set()

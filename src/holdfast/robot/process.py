@@ -256,7 +256,8 @@ class RobotProcess:
             return f"trial {self._replayed} (seed {seed}), as the journal has it"
         if self._starting is not None:
             return f"trial {self._starting[0]} (seed {seed})"
-        return f"trial {self.robot.trial} (seed {seed}), step {self.robot.step}"
+        step = None if (state := self.robot.state) is None else state.step
+        return f"trial {self.robot.trial} (seed {seed}), step {step}"
 
     def _interrupt(self, number: int | None, within_s: float | None = None) -> None:
         """Ask for an end in order, from any thread or a signal's handler."""

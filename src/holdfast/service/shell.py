@@ -92,9 +92,9 @@ class ServiceShell:
         self._on_decision = on_decision
         self._calls: dict[int, IncomingCall] = {}
         self._numbers = itertools.count(1)
-        self._undecoded = 0
+        # Large requests that are being decoded, of each robot; and their bytes.
+        self._undecoded: Counter[str | None] = Counter()
         self._undecoded_bytes = 0
-        self._undecoded_of: Counter[str | None] = Counter()
         self._unread = 0
         self._rates = EventRates()
         self._brief_jobs: deque[Job] = deque()
@@ -198,11 +198,10 @@ class ServiceShell:
         size = len(payload)
         if size <= _LARGE_BYTES:
             self._decoded(call, size, _decode(payload))
-        elif self._undecoded >= _MAX_UNDECODED or self._takes_too_much(call.robot, size):
+        elif self._undecoded.total() >= _MAX_UNDECODED or self._takes_too_much(call.robot, size):
             self._reject_unread(call)
         else:
-            self._undecoded += 1
-            self._undecoded_of[call.robot] += 1
+            self._undecoded[call.robot] += 1
             self._undecoded_bytes += size
             done = functools.partial(self._guarded, self._large_one_decoded, call, size)
             self._decoder.submit(functools.partial(_decode, payload), done)
@@ -210,9 +209,9 @@ class ServiceShell:
     def _takes_too_much(self, robot: str | None, size: int) -> bool:
         """Return whether a large request exceeds the bound on bytes."""
         wanted_bytes = self._undecoded_bytes + size
-        if self._undecoded_of[robot]:
+        if self._undecoded[robot]:
             return wanted_bytes > _MAX_UNDECODED_BYTES
-        return self._undecoded > 0 and wanted_bytes > 2 * _MAX_UNDECODED_BYTES
+        return bool(self._undecoded) and wanted_bytes > 2 * _MAX_UNDECODED_BYTES
 
     def _reject_unread(self, call: IncomingCall) -> None:
         self._unread += 1
@@ -222,10 +221,9 @@ class ServiceShell:
     def _large_one_decoded(
         self, call: IncomingCall, size: int, request: Request | MessageError
     ) -> None:
-        self._undecoded -= 1
-        self._undecoded_of[call.robot] -= 1
-        if not self._undecoded_of[call.robot]:
-            del self._undecoded_of[call.robot]
+        self._undecoded[call.robot] -= 1
+        if not self._undecoded[call.robot]:
+            del self._undecoded[call.robot]
         self._undecoded_bytes -= size
         self._decoded(call, size, request)
 
