@@ -375,25 +375,20 @@ class Dispatcher(DecisionSource):
                 if replica.usable(now) and not self._calls.is_asked(replica, question):
                     self._calls.send(replica, question, now, waited_s=self.waited_s(now))
                     return
-            if self._services.is_starting(now):
+            if services.is_starting(now):
                 return
             busy_until = services.busy_until(now)
             if busy_until is not None:
                 since = now if self.needed_at is None else self.needed_at
                 is_long = busy_until - since > self._detection_timeout_s
-                if not is_long and not self._services.local_usable(now):
+                if not is_long and not services.local_usable(now):
                     return
-        if services.local is None:
-            self._hold_and_retry(question, now)
-            return
-        if not self.tracker.is_recovering:
+        if services.local is not None and not self.tracker.is_recovering:
             self._lose_cloud(now)
-            self._tend_recovery(now)
-        if self._services.local_usable(now):
-            if not self._calls.is_asked(services.local, question):
-                self._calls.send(services.local, question, now, waited_s=self.waited_s(now))
-            return
-        self._hold_and_retry(question, now)
+        if services.local is None or not services.local_usable(now):
+            self._hold_and_retry(question, now)
+        elif not self._calls.is_asked(services.local, question):
+            self._calls.send(services.local, question, now, waited_s=self.waited_s(now))
 
     def _hold_and_retry(self, question: Question, now: float) -> None:
         """Ask any present service, suspected or not, at growing intervals."""
@@ -446,13 +441,14 @@ class Dispatcher(DecisionSource):
             and not any(replica.reliable for replica in self._services.cloud)
         ):
             self._lose_cloud(now)
-            self._tend_recovery(now)
 
     def _lose_cloud(self, now: float) -> None:
+        """Start the recovery."""
         reason, silence_s = self._services.why_lost(), self._services.silence_s(now)
         self.effects.report(
             "status", **self.tracker.change(Cause.CLOUD_LOST, reason, now, silence_s)
         )
+        self._tend_recovery(now)
 
     # -- standing still --------------------------------------------------------------------------
 

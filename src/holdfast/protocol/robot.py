@@ -361,23 +361,18 @@ class Robot:
             if self._source.stopped_by is not None:
                 return
             where += ", whose task action was performed"
+        kind: type[HoldfastError] = HeldError
+        if event.action_in_doubt and event.counts_steps:
+            where += ", and whether its task action was performed is not known"
+        elif event.action_in_doubt:
+            kind = UnknownPerformanceError
+            where += (
+                ", and nobody can say whether its task action was performed, because the "
+                "environment has no method steps_performed; this trial cannot be gone on with, "
+                "since no action must be performed twice"
+            )
         # The account of the failure comes last: it may have many lines.
-        if not event.action_in_doubt:
-            self._source.stop(HeldError(f"{where}: {event.text}"))
-        elif event.counts_steps:
-            self._source.stop(
-                HeldError(
-                    f"{where}, and whether its task action was performed is not known: {event.text}"
-                )
-            )
-        else:
-            self._source.stop(
-                UnknownPerformanceError(
-                    f"{where}, and nobody can say whether its task action was performed, because "
-                    "the environment has no method steps_performed; this trial cannot be gone on "
-                    f"with, since no action must be performed twice: {event.text}"
-                )
-            )
+        self._source.stop(kind(f"{where}: {event.text}"))
 
     # -- the loop --------------------------------------------------------------------------------
 
