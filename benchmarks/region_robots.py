@@ -251,9 +251,7 @@ class RegionRobot:
         history = replay(setup.planner, setup.seed, trial, [], 0.001)
         begun = EnvironmentReady(ending_of(self._environment.done), 0)
         self._carry_out(
-            self._machine.begin_trial(
-                trial, history, begun, self._scheduler.now, tail_is_certain=True
-            )
+            self._machine.begin_trial(history, begun, self._scheduler.now, tail_is_certain=True)
         )
 
     def _carry_out(self, effects: list[RobotEffect]) -> None:

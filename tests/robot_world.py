@@ -292,9 +292,7 @@ class World:
             self.environment.perform(action)
         ending = ending_of(self.environment.is_done())
         begun = EnvironmentReady(ending, self.environment.step)
-        self.carry_out(
-            self.robot.begin_trial(trial, history, begun, self.now, tail_is_certain=True)
-        )
+        self.carry_out(self.robot.begin_trial(history, begun, self.now, tail_is_certain=True))
 
     def run(self, until_s: float = 60.0) -> None:
         while not self.ended and self.stopped is None:

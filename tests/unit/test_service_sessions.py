@@ -396,7 +396,7 @@ def test_the_nearest_state_before_a_request() -> None:
     session = session_of(1)
     state = robot.state
     assert session.state_before(request) is None
-    assert not session.knows_trial(state.trial)
+    assert not session.states_of(state.trial)
     session.acknowledged = state._replace(step=request.step, sensed=request.sensed)
     assert session.state_before(request) is session.acknowledged
     session.ahead = state._replace(step=request.step + 1, sensed=False)
@@ -405,8 +405,8 @@ def test_the_nearest_state_before_a_request() -> None:
     assert session.state_before(request) is session.ahead
     session.ahead = session.ahead._replace(trial=state.trial + 1)
     assert session.state_before(request) is session.acknowledged
-    assert session.knows_trial(state.trial + 1)
-    assert not session.knows_trial(state.trial + 2)
+    assert session.states_of(state.trial + 1)
+    assert not session.states_of(state.trial + 2)
     session.acknowledged = state._replace(step=request.step, sensed=not request.sensed)
     assert (session.state_before(request) is None) == (not request.sensed)
 

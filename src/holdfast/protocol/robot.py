@@ -85,7 +85,6 @@ class Robot:
         # One list for both, because the order of all effects counts.
         self._effects = source.effects
         self._history: Trial | None = None
-        self._trial = 0
         self._ending: Ending | None = None
         self._lost_at: int | None = None
         self._awaits_environment = False
@@ -120,7 +119,7 @@ class Robot:
     @property
     def trial(self) -> int | None:
         """The current trial; None between trials."""
-        return None if self._history is None else self._trial
+        return None if self._history is None else self._history.state.trial
 
     @property
     def state(self) -> PlanningState | None:
@@ -144,7 +143,6 @@ class Robot:
 
     def begin_trial(
         self,
-        trial: int,
         # From :func:`~holdfast.planning.tracking.replay`; of no records for a new trial.
         history: Trial,
         begun: EnvironmentReady,
@@ -154,7 +152,6 @@ class Robot:
         tail_is_certain: bool,
     ) -> list[RobotEffect]:
         """Begin or resume a trial."""
-        self._trial = trial
         self._history = history
         self._ending = begun.ending
         self._lost_at = None
@@ -163,7 +160,7 @@ class Robot:
         self._next_tick = None
         resumed = history.begun
         if resumed:
-            self._effects.report("resumed_trial", trial=trial, step=history.state.step)
+            self._effects.report("resumed_trial", trial=self.trial, step=history.state.step)
         try:
             if history.is_lost and history.pending is None and self._lost.on_lost == "reinitialise":
                 # The process ended between the observation and this, or held still there.
@@ -190,7 +187,7 @@ class Robot:
         """Return the pending task action if it was not performed and must be performed now."""
         history, performed = self._current_history, begun.steps_performed
         known = history.state.step
-        where = f"trial {self._trial}, step {history.state.step}"
+        where = f"trial {history.state.trial}, step {history.state.step}"
         if performed is None:
             if not resumed or (history.pending is None and (history.paused or tail_is_certain)):
                 return None
@@ -206,7 +203,7 @@ class Robot:
                 "trial anew in another directory (--out)"
             )
         if history.pending is not None and performed == known + 1:
-            self._effects.report("performed_unseen", trial=self._trial, step=known)
+            self._effects.report("performed_unseen", trial=self.trial, step=known)
             self._fold_move(begun.last or Moved(known, None))
             return None
         if performed != known:
@@ -354,7 +351,7 @@ class Robot:
         self._judge(late.taken, of="late")
 
     def _failed(self, event: EnvironmentFailed) -> None:
-        where = f"the robot holds still in trial {self._trial}, step {event.step}"
+        where = f"the robot holds still in trial {self.trial}, step {event.step}"
         if event.performed is not None:
             # What is written down now needs no environment that counts when the run goes on.
             self._performed(event.performed)
@@ -413,7 +410,7 @@ class Robot:
             and answer.digest != self._planner.digest(state)[:DIGEST_SIZE]
         ):
             # Chosen for another state than this: the service's belief has drifted from ours.
-            self._effects.report("prefetch_unused", trial=self._trial, step=state.step)
+            self._effects.report("prefetch_unused", trial=self.trial, step=state.step)
             self._source.recompute()
             self._ask(self._planner.digest(state), now)
             self._source.await_answer(now)
@@ -526,9 +523,9 @@ class Robot:
             # A recovery alone does not begin a trial.
             self._count_recoveries()
         self._unwritten += records
-        if self._unwritten:
+        if self._unwritten and history is not None:
             # The effects that follow may rest on these records.
-            self._effects.append(WriteRecords(self._trial, tuple(self._unwritten)))
+            self._effects.append(WriteRecords(history.state.trial, tuple(self._unwritten)))
             self._unwritten = []
 
     def _count_recoveries(self) -> None:
@@ -545,7 +542,7 @@ class Robot:
         step = question.state.step if kind == "task" else question.sensing_step
         self._effects.append(
             Timing(
-                self._trial,
+                question.state.trial,
                 step if step is not None else question.state.step,
                 kind,
                 provenance.service,

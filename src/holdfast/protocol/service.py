@@ -433,7 +433,7 @@ class Service:
             state is None
             and request is not None
             and request.checkpoint is None
-            and session.knows_trial(request.trial)
+            and session.states_of(request.trial)
         ):
             # The robot is behind what is remembered, or was elsewhere meanwhile.
             session.remove_task(task)

@@ -275,20 +275,13 @@ class Session:
     def state_before(self, request: Request) -> PlanningState | None:
         """Return the nearest state before the request's; None if there is none."""
         asked = request.step, request.sensed
-        for known in self._states():
-            if known is None or known.trial != request.trial:
-                continue
-            if (known.step, known.sensed) <= asked:
-                return known
-        return None
+        states = self.states_of(request.trial)
+        return next((each for each in states if (each.step, each.sensed) <= asked), None)
 
-    def knows_trial(self, trial: int) -> bool:
-        """Return whether a state of the trial is held."""
-        return any(known is not None and known.trial == trial for known in self._states())
-
-    def _states(self) -> tuple[PlanningState | None, ...]:
-        """Return the states from which it may go on, the later first."""
-        return () if self.acknowledged is None else (self.ahead, self.acknowledged)
+    def states_of(self, trial: int) -> list[PlanningState]:
+        """Return the states from which a trial may go on, the later first."""
+        held = () if self.acknowledged is None else (self.ahead, self.acknowledged)
+        return [each for each in held if each is not None and each.trial == trial]
 
     def size(self) -> int:
         """Return the bytes of its states and answers."""

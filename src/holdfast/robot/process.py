@@ -400,9 +400,7 @@ class RobotProcess:
             self._starting = None
             if isinstance(event, EnvironmentFailed):
                 raise HeldError(f"trial {trial} cannot go on at step {event.step}: {event.text}")
-            self._carry_out(
-                robot.begin_trial(trial, history, event, now, tail_is_certain=tail_is_certain)
-            )
+            self._carry_out(robot.begin_trial(history, event, now, tail_is_certain=tail_is_certain))
             if self._watch is not None:
                 self._watch.begun()
         elif not isinstance(event, EnvironmentReady):
