@@ -155,9 +155,8 @@ class Dispatcher(DecisionSource):
 
     def recompute(self) -> None:
         """Have the own planner answer the question too."""
-        question = self.question
-        if question is not None:
-            self._verification.check(question)
+        if self.question is not None:
+            self._verification.check(self.question)
 
     @property
     def num_unverified(self) -> int:
@@ -454,17 +453,16 @@ class Dispatcher(DecisionSource):
 
     def _report_wait(self, question: Question, now: float) -> None:
         """Report, once per question, that a service takes its time while the robot waits."""
-        needed_at = self.needed_at
-        if needed_at is None or question is self._reported_wait:
+        if self.needed_at is None or question is self._reported_wait:
             return
-        if now >= needed_at + self._patience_s:
+        if now >= self.needed_at + self._patience_s:
             self._reported_wait = question
             asked = {call.replica.name for call in self._calls.about(question)}
             self.effects.report(
                 "waiting",
                 service=", ".join(sorted(asked)),
                 step=question.state.step,
-                waited_ms=1e3 * (now - needed_at),
+                waited_ms=1e3 * self.waited_s(now),
             )
 
     def _end_hold(self, now: float) -> None:

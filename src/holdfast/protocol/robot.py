@@ -401,8 +401,8 @@ class Robot:
         question = self._question()
         if question is None or question.sensing_step != state.step:
             question = self._ask(self._planner.digest(state), now)
-        answer = question.sensing
-        if answer is None:
+        answer, provenance = question.sensing, question.sensing_provenance
+        if answer is None or provenance is None:
             self._source.await_answer(now)
             return
         if (
@@ -415,10 +415,8 @@ class Robot:
             self._ask(self._planner.digest(state), now)
             self._source.await_answer(now)
             return
-        provenance = question.sensing_provenance
-        assert provenance is not None
         self._computed_ms = 1e3 * provenance.computed_s
-        self._timed("sensing", question, provenance, now)
+        self._timed("sensing", state, provenance, now)
         self._sensing_action = answer.sensing_action
         if answer.sensing_action == self._planner.no_sensing:
             self._sensed(Sensed(state.step, answer.sensing_action, b""), now)
@@ -449,7 +447,7 @@ class Robot:
             question.follow_tasks([*actions, own], provenance)
         if offset == 0 and provenance is not self._timed_provenance:
             self._timed_provenance = provenance
-            self._timed("task", question, provenance, now)
+            self._timed("task", state, provenance, now)
         if not self._take_tick(now):
             return
         action = question.order(offset)
@@ -537,13 +535,12 @@ class Robot:
             history.recoveries += times
             self._unwritten.append(LocalTookOverRecord(times))
 
-    def _timed(self, kind: str, question: Question, provenance: Provenance, now: float) -> None:
+    def _timed(self, kind: str, state: PlanningState, provenance: Provenance, now: float) -> None:
         self.has_decided = True
-        step = question.state.step if kind == "task" else question.sensing_step
         self._effects.append(
             Timing(
-                question.state.trial,
-                step if step is not None else question.state.step,
+                state.trial,
+                state.step,
                 kind,
                 provenance.service,
                 self._source.tracker.status.value,

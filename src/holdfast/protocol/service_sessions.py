@@ -412,10 +412,11 @@ class SessionTable:
 
     def has_room_for(self, session: Session) -> bool:
         """Return whether a session fits without dropping another; the only one always fits."""
+        configuration_bytes = self.configuration_bytes + len(session.configuration)
         return not self._sessions or not (
             self._is_full_for(session.owner)
             or self._is_full
-            or self._lacks_room_for_configuration(session)
+            or configuration_bytes > self._limits.max_configuration_bytes
         )
 
     def evictable_for(self, session: Session) -> Session | None:
@@ -439,12 +440,6 @@ class SessionTable:
     @property
     def _is_full(self) -> bool:
         return len(self._sessions) >= self._limits.max_sessions
-
-    def _lacks_room_for_configuration(self, session: Session) -> bool:
-        return (
-            self.configuration_bytes + len(session.configuration)
-            > self._limits.max_configuration_bytes
-        )
 
     def _unused_of_most(self, held: Counter[Owner], *, only_unserved: bool) -> Session | None:
         """Return the least recently used session without tasks, of the owners that hold the most.
