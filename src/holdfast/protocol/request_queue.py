@@ -204,15 +204,6 @@ class RequestQueue:
         self.running[job] = task
         self._started_at[job] = now
 
-    @property
-    def running_bytes(self) -> float:
-        """Estimated memory of all running tasks."""
-        return sum(task.num_bytes for task in self.running.values())
-
-    def job_of(self, task: PendingTask) -> Job:
-        """Return the job of a running task."""
-        return next(job for job, other in self.running.items() if other is task)
-
     def started(self, job: Job, now: float) -> None:
         """Note that a worker starts its task only now."""
         self._started_at[job] = now

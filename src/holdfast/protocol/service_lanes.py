@@ -105,7 +105,8 @@ class Lanes:
                 continue
             room_bytes = math.inf
             if number == LONG and lane.running:
-                room_bytes = self._limits.max_decision_bytes - lane.running_bytes
+                taken_bytes = sum(task.num_bytes for task in lane.running.values())
+                room_bytes = self._limits.max_decision_bytes - taken_bytes
             if (task := lane.take(now, room_bytes)) is not None:
                 return task
         return None
@@ -166,7 +167,8 @@ class Lanes:
             if task.lane == LONG:
                 # Further calls that ask for the same do not wait for this one.
                 task.session.remove_task(task)
-                self[task.lane].job_of(task).cancel()
+                running = self[LONG].running.items()
+                next(job for job, other in running if other is task).cancel()
             return False
         task.session.remove_task(task)
         self[task.lane].remove(task)
