@@ -46,7 +46,7 @@ from holdfast.protocol.robot_events import (
     Timing,
 )
 from holdfast.protocol.service import Service
-from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
+from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast_lab.simulation.checked_memo import CheckedPlanner, JobCache
 from holdfast_lab.simulation.environment_model import EnvironmentModel
@@ -136,8 +136,8 @@ class MachineShell:
                 self._reply(effect.call, effect.payload)
             elif isinstance(effect, EndCall):
                 self._end(effect.call)
-            elif isinstance(effect, StartJob):
-                self._begin(effect.job)
+            elif isinstance(effect, Job):
+                self._begin(effect)
         due = self.machine.next_wakeup()
         if due is not None and due < self._wakes_at:
             self._wakes_at = due
@@ -233,10 +233,11 @@ class RegionRobot:
 
     def waits_since(self) -> float:
         """Return since when the robot stands still for a decision; infinity if it does not."""
-        question = self._machine._source.question
-        if question is None or question.complete or question.needed_at is None:
+        source = self._machine._source
+        question, needed_at = source.question, source.needed_at
+        if question is None or question.complete or needed_at is None:
             return math.inf
-        return question.needed_at
+        return needed_at
 
     def hear(self, event: Any) -> None:
         """Take what has come over the wire."""
@@ -250,9 +251,7 @@ class RegionRobot:
         history = replay(setup.planner, setup.seed, trial, [], 0.001)
         begun = EnvironmentReady(ending_of(self._environment.done), 0)
         self._carry_out(
-            self._machine.begin_trial(
-                trial, history, begun, self._scheduler.now, tail_is_certain=True
-            )
+            self._machine.begin_trial(history, begun, self._scheduler.now, tail_is_certain=True)
         )
 
     def _carry_out(self, effects: list[RobotEffect]) -> None:

@@ -207,7 +207,7 @@ class World:
         self.launchable = True
         self.launch_s = 0.2
         recovery = RecoverySettings(launch=launch)  # type: ignore[arg-type]
-        dispatcher = Dispatcher(
+        self.dispatcher = Dispatcher(
             services,
             LOCAL,
             self.offload,
@@ -223,7 +223,7 @@ class World:
         self.own = self.decide
         self.verified: list[VerificationNoted] = []
         self.planner, self.simulator = Planner(PROBLEM, planning), simulator
-        self.robot = Robot(self.planner, simulator, dispatcher, rate_hz, self.lost)
+        self.robot = Robot(self.planner, simulator, self.dispatcher, rate_hz, self.lost)
         self.environment = SimulatedEnvironment(PROBLEM, simulator.seed, 0)
         self.heap: list[tuple[float, int, Callable[[], list[RobotEffect]]]] = []
         self.count = 0
@@ -292,9 +292,7 @@ class World:
             self.environment.perform(action)
         ending = ending_of(self.environment.is_done())
         begun = EnvironmentReady(ending, self.environment.step)
-        self.carry_out(
-            self.robot.begin_trial(trial, history, begun, self.now, tail_is_certain=True)
-        )
+        self.carry_out(self.robot.begin_trial(history, begun, self.now, tail_is_certain=True))
 
     def run(self, until_s: float = 60.0) -> None:
         while not self.ended and self.stopped is None:

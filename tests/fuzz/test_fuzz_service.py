@@ -4,6 +4,7 @@ Rules send whatever may come, in any order, and let jobs end in any order. After
 that the machine holds is measured, not only what it says of itself.
 """
 
+import math
 import random
 from typing import Any
 
@@ -218,14 +219,13 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     assert statistics.running == len(running) == len(bench.jobs)
     fewer = max(1, bench.workers - 1)
     most = {NEW: fewer, FIRST: fewer, BRIEF: bench.workers, MEDIUM: fewer, LONG: fewer}
-    assert all(len(lanes[number].running) <= most[number] for number in most)
     assert statistics.waiting == len(waiting)
-    for lane in lanes:
-        check_lane(lane, [task for task in waiting if queue[task.lane] is lane])
     for number, lane in enumerate(lanes):
-        requested = [
-            task for task in waiting if task.request is not None and queue[task.lane] is lane
-        ]
+        # Short ones run together with others.
+        assert sum(job.expected_s == math.inf for job in lane.running) <= most[number]
+        in_lane = [task for task in waiting if queue[task.lane] is lane]
+        check_lane(lane, in_lane)
+        requested = [task for task in in_lane if task.request is not None]
         room = limits["max_waiting"] if number > FIRST else (limits["max_waiting"] + 1) // 2
         # One owner finds room, if another has taken that of all.
         assert len(requested) <= max(room, 2 * bench.workers) + 2 * bench.workers
@@ -236,11 +236,12 @@ def check_limits(bench: Bench, limits: dict[str, Any]) -> None:
     for task in tasks:
         assert task.request is None or task.request.session_configuration is None
     # Calls: each waits for one work that is still to be done.
-    attached = [record for task in tasks for record in task.calls.values()]
+    attached = [record for waiting in calls._of.values() for record in waiting.values()]
+    assert set(calls._of) <= set(tasks)
     assert len(attached) == len(calls) == statistics.calls
     assert all(calls._calls[record.call] is record for record in attached)
     most = 2 * limits["max_calls_per_request"]
-    assert all(len(task.calls) <= most for task in tasks)
+    assert all(0 < len(waiting) <= most for waiting in calls._of.values())
     assert set(calls._calls) == set(bench.replies) - bench.ended
     # Problems.
     pool = service._problems._idle

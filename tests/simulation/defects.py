@@ -426,7 +426,7 @@ _defect(
         "due += [replica.detector.deadline() for replica in services]",
         "pass",
     ),
-    Edit(Dispatcher, "next_wakeup", "elif question.needed_at is not None:", "elif False:"),
+    Edit(Dispatcher, "next_wakeup", "elif self.needed_at is not None:", "elif False:"),
 )
 _defect(
     "retry_not_timed",

@@ -115,7 +115,6 @@ def begin_after(
         world.environment.perform(action)
     world.carry_out(
         world.robot.begin_trial(
-            0,
             history,
             EnvironmentReady(None, steps_performed),
             0.0,
@@ -136,7 +135,7 @@ def test_what_came_late_is_written_before_a_pending_action_is_ordered(on_lost: O
     robot = Robot(planner, SimulatorSettings(), InProcessSource(), lost=lost)
     late = (Late(0, 0, encode_floats([1e3])),)
     begun = EnvironmentReady(None, 0, None, late)
-    effects = robot.begin_trial(0, history, begun, 0.0, tail_is_certain=True)
+    effects = robot.begin_trial(history, begun, 0.0, tail_is_certain=True)
     kinds = [type(effect) for effect in effects if not isinstance(effect, LogEvent)]
     times = 2 if on_lost == "reinitialise" else 1
     assert kinds == [*[WriteRecords] * times, Halt if on_lost == "hold" else Act]
@@ -150,7 +149,7 @@ def test_the_lines_about_what_nobody_awaits_are_bounded() -> None:
     robot = Robot(planner, SimulatorSettings(), InProcessSource())
     late = (Late(0, 7, bytes(8)),) * 1000
     begun = EnvironmentReady(None, 0, None, late)
-    effects = robot.begin_trial(0, Trial(planner, 11, 0), begun, 0.0, tail_is_certain=True)
+    effects = robot.begin_trial(Trial(planner, 11, 0), begun, 0.0, tail_is_certain=True)
     told = [e.fields for e in effects if isinstance(e, LogEvent) and e.name == "late_unused"]
     assert len(told) == 10
     assert str(told[-1]["reason"]).endswith("further ones of this trial are counted only")
@@ -167,7 +166,7 @@ def test_what_cannot_be_folded_in_is_not_written_down() -> None:
     def begin(last: Moved) -> list[RobotEffect]:
         robot = Robot(planner, SimulatorSettings(), InProcessSource())
         begun = EnvironmentReady(None, 1, last)
-        return robot.begin_trial(0, history, begun, 0.0, tail_is_certain=True)
+        return robot.begin_trial(history, begun, 0.0, tail_is_certain=True)
 
     effects = begin(Moved(0, None, encode_floats([0.5])))
     assert isinstance(effects[-1], Halt)
@@ -196,7 +195,7 @@ def test_what_comes_with_a_move_is_written_before_a_lost_robot_holds_still(lost_
     sense(history, 0, np.array([0.0]), 1.0)
     history.pending, _ = planner.choose_task_action(history.state)
     robot = Robot(planner, SimulatorSettings(), InProcessSource(), lost=lost)
-    robot.begin_trial(0, history, EnvironmentReady(None, 3), 0.0, tail_is_certain=True)
+    robot.begin_trial(history, EnvironmentReady(None, 3), 0.0, tail_is_certain=True)
     late = (Late(4, 2, encode_floats([1e3])), Late(4, 0, bytes(8)))
     moved = Moved(3, None, b"", bytes(8) if lost_by == "move" else b"")
     effects = robot.handle(Acted(moved, None, late), 0.0)
@@ -275,7 +274,8 @@ def test_what_fails_after_an_action_was_performed_leaves_it_in_the_journal() -> 
     # The effects come in this order: what is to be written down is, before the robot stops.
     resumed = begin_after(tuple(world.journal), None)
     assert resumed.stopped is None
-    assert resumed.robot.step == 6
+    state = resumed.robot.state
+    assert state is not None and state.step == 6
 
 
 class TestFailedTask:
@@ -309,7 +309,7 @@ class TestFailedTask:
         resumed.carry_out(resumed.robot.start(0.0))
         history = replay(resumed.planner, 11, 0, killed.journal)
         begun = EnvironmentReady(ending_of(killed.environment.is_done()), killed.environment.step)
-        resumed.carry_out(resumed.robot.begin_trial(0, history, begun, 0.0, tail_is_certain=True))
+        resumed.carry_out(resumed.robot.begin_trial(history, begun, 0.0, tail_is_certain=True))
         self.assert_failed(resumed)
 
     @pytest.mark.parametrize("environment_class", [FailingWorld, SimulatedEnvironment])

@@ -57,7 +57,7 @@ from holdfast.protocol.messages import (
     encode,
 )
 from holdfast.protocol.service import Service
-from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
+from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast.protocol.service_sessions import SHORT_S
 from holdfast.robot.environment import SimulatedEnvironment
@@ -111,9 +111,9 @@ class Bench:
             elif isinstance(effect, EndCall):
                 assert effect.call not in self.ended
                 self.ended.add(effect.call)
-            elif isinstance(effect, StartJob):
-                self.jobs.append(effect.job)
-                self.trace.append((f"run {effect.job.kind}", -1))
+            elif isinstance(effect, Job):
+                self.jobs.append(effect)
+                self.trace.append((f"run {effect.kind}", -1))
             elif isinstance(effect, LogEvent):
                 self.notes.append(effect)
         threads = [job for job in self.jobs if job.interruption.most_s > 5 * SHORT_S]
@@ -809,12 +809,12 @@ def runs_of(service: Service, call: int, request: Request, now: float) -> list[f
     """Have a request answered; return how long each of its jobs was expected to take."""
     expected = []
     service.receive(call, request, len(encode(request)), now)
-    while runs := [each for each in service.next_jobs(now) if isinstance(each, StartJob)]:
-        (run,) = runs
-        expected.append(run.expected_s)
-        service.started(run.job, now)
+    while jobs := [each for each in service.next_jobs(now) if isinstance(each, Job)]:
+        (job,) = jobs
+        expected.append(job.expected_s)
+        service.started(job, now)
         now += 0.001
-        service.finished(run.job, run.job.run(), now)
+        service.finished(job, job.run(), now)
     return expected
 
 

@@ -12,7 +12,13 @@ from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.protocol.dispatcher import Dispatcher
 from holdfast.protocol.messages import MAX_TASK_ACTIONS, SensingAnswer, TaskAnswer
-from holdfast.protocol.question import DecisionSource, InProcessSource, Question, same_actions
+from holdfast.protocol.question import (
+    DecisionSource,
+    InProcessSource,
+    Provenance,
+    Question,
+    same_actions,
+)
 
 
 def question(step: int = 0, *, sensed: bool = False, interval: int = 2) -> Question:
@@ -40,11 +46,11 @@ def test_the_answer_ends_with_the_next_sensing_action(
 
 def test_it_is_complete_with_both_parts() -> None:
     asked = question(sensed=True)
-    asked.task_actions = [np.zeros(3)] * 3
+    provenance = Provenance("cloud", 0.0, 0.0)
+    asked.follow_tasks([np.zeros(3)] * 3, provenance)
     assert not asked.complete
-    other = question(sensed=True)
-    other.task_actions, other.sensing = asked.task_actions, SensingAnswer(1, 3, 0, asked.digest, 0)
-    assert other.complete
+    asked.follow_sensing(SensingAnswer(1, 3, 0, asked.digest, 0), provenance)
+    assert asked.complete
 
 
 def test_replies_that_cannot_answer_it_are_refused() -> None:

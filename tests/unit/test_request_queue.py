@@ -25,8 +25,7 @@ class TestRequestQueue:
             (None, request.session),
             request,
             robot.session_configuration,
-            ExpectedTime(0.001),
-            ExpectedTime(0.001),
+            (ExpectedTime(0.001), ExpectedTime(0.001)),
         )
 
     def task(self, session: Session, name: bytes, since: float, *, prefetched: bool) -> PendingTask:
@@ -58,7 +57,8 @@ class TestRequestQueue:
         return task.digest, job
 
     def finish(self, job: Job) -> None:
-        self.queue.release_held(self.queue.end(job).session)
+        task, _ = self.queue.end(job)
+        self.queue.release_held(task.session)
 
     def test_those_that_robots_stand_still_for_go_first(self) -> None:
         self.task(self.session(1), b"ahead", 0.0, prefetched=True)
@@ -134,8 +134,7 @@ def made(
         (owner, request.session),
         request,
         robot.session_configuration,
-        ExpectedTime(0.05),
-        ExpectedTime(0.05),
+        (ExpectedTime(0.05), ExpectedTime(0.05)),
     )
     return PendingTask(
         session,
@@ -267,7 +266,7 @@ class TestTheWait:
         self.queue.started(job, 1.5)
         assert self.wait_s(1.51) == pytest.approx(0.04 / 4)
         assert self.wait_s(9.0) == 0.0  # longer than was expected
-        assert self.queue.end(job) is task
+        assert self.queue.end(job) == (task, 1.5)
         assert [*running, task.running] == [True, False]
         assert (len(self.queue.running), self.wait_s(1.5)) == (0, 0.0)
 

@@ -105,7 +105,7 @@ def plain_digests(configuration: Configuration) -> list[str]:
 class Machine:
     """A machine that is scripted: what it is told comes into a trace."""
 
-    trial = step = 0
+    trial, state = 0, None
     num_unverified = 0
 
     def __init__(self) -> None:

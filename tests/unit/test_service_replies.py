@@ -24,7 +24,7 @@ class Replies:
         request = robot.request()
         key = None, request.session
         times = ExpectedTime(0.001), ExpectedTime(0.001)
-        session = Session(key, request, robot.session_configuration, *times)
+        session = Session(key, request, robot.session_configuration, times)
         self.task = PendingTask(
             session, b"d" * 16, sensing=True, request=request, state=None, size=9, since=0.0
         )

@@ -13,7 +13,7 @@ from holdfast.problems.problem import Problem
 from holdfast.protocol.computing_time import ExpectedTime
 from holdfast.protocol.messages import Request, SessionConfiguration, encode
 from holdfast.protocol.service import Service
-from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect, StartJob
+from holdfast.protocol.service_jobs import EndCall, Job, SendReply, ServiceEffect
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast.protocol.service_sessions import (
     CachedAnswer,
@@ -137,8 +137,8 @@ class _Split:
 
     def _apply(self, owner: str | None, effects: list[ServiceEffect]) -> None:
         for effect in (*effects, *self.service.next_jobs(0.0)):
-            if isinstance(effect, StartJob):
-                self.jobs[owner].append(effect.job)
+            if isinstance(effect, Job):
+                self.jobs[owner].append(effect)
             elif isinstance(effect, SendReply | EndCall):
                 whose, number = self._calls[effect.call]
                 assert whose == owner, "what one owner does tells another something"
@@ -221,8 +221,7 @@ def session_of(number: int, owner: str | None = "anna") -> Session:
         (owner, request.session),
         request,
         robot.session_configuration,
-        ExpectedTime(),
-        ExpectedTime(),
+        (ExpectedTime(), ExpectedTime()),
     )
 
 
@@ -397,7 +396,7 @@ def test_the_nearest_state_before_a_request() -> None:
     session = session_of(1)
     state = robot.state
     assert session.state_before(request) is None
-    assert not session.knows_trial(state.trial)
+    assert not session.states_of(state.trial)
     session.acknowledged = state._replace(step=request.step, sensed=request.sensed)
     assert session.state_before(request) is session.acknowledged
     session.ahead = state._replace(step=request.step + 1, sensed=False)
@@ -406,8 +405,8 @@ def test_the_nearest_state_before_a_request() -> None:
     assert session.state_before(request) is session.ahead
     session.ahead = session.ahead._replace(trial=state.trial + 1)
     assert session.state_before(request) is session.acknowledged
-    assert session.knows_trial(state.trial + 1)
-    assert not session.knows_trial(state.trial + 2)
+    assert session.states_of(state.trial + 1)
+    assert not session.states_of(state.trial + 2)
     session.acknowledged = state._replace(step=request.step, sensed=not request.sensed)
     assert (session.state_before(request) is None) == (not request.sensed)
 
@@ -415,8 +414,8 @@ def test_the_nearest_state_before_a_request() -> None:
 def test_which_tasks_earlier_times_predict() -> None:
     session = session_of(1)
     session.built_in = session.served = True
-    session.task_time.learn(0.001)
-    session.sensing_time.learn(0.001)
+    for time in session.times:
+        time.learn(0.001)
     interval = session.planning.sensing_interval
     robot = Robot(key=1)
     robot.sense()

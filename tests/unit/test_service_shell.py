@@ -39,7 +39,6 @@ from holdfast.protocol.service_jobs import (
     JobResult,
     SendReply,
     ServiceEffect,
-    StartJob,
 )
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast.service import shell
@@ -370,9 +369,9 @@ async def test_what_happens_often_is_logged_now_and_then_with_its_number(event: 
 class Script(Service):
     """A machine that hands out the jobs that a test has made."""
 
-    def __init__(self, *runs: StartJob) -> None:
+    def __init__(self, *jobs: Job) -> None:
         super().__init__(ProblemFactory(), 2)
-        self.runs = list(runs)
+        self.jobs = list(jobs)
         self.begun_at = 0.0
         self.trace: list[str] = []
         self.times: list[float] = []
@@ -380,8 +379,8 @@ class Script(Service):
 
     def receive(self, call: int, *arguments: Any) -> list[ServiceEffect]:
         self.trace.append(f"call {call} of {arguments[-1]}")
-        runs, self.runs = self.runs, []
-        return [SendReply(call, b"first"), *runs]
+        jobs, self.jobs = self.jobs, []
+        return [SendReply(call, b"first"), *jobs]
 
     def started(self, job: Job, now: float) -> None:
         self.trace.append(f"begun {job.kind}")
@@ -401,19 +400,19 @@ class Script(Service):
         return []
 
 
-class Scripted:
+class Scripted(Job):
     """A job of a script."""
 
-    is_like = Job.is_like
-    company = None
-
-    def __init__(self, kind: str, run: Callable[[], object]) -> None:
-        self.kind = kind
-        self.run = run
+    def __init__(self, kind: str, expected_s: float, run: Callable[[], object]) -> None:
+        self.kind = kind  # type: ignore[assignment]
+        self.company = None
+        self.expected_s = expected_s
+        self.is_brief = True
+        self.run = run  # type: ignore[assignment,method-assign]
 
 
 def scripted(*jobs: tuple[str, float, Callable[[], object]]) -> tuple[Script, ServiceShell]:
-    machine = Script(*(StartJob(cast(Job, Scripted(kind, run)), s, True) for kind, s, run in jobs))
+    machine = Script(*(Scripted(*job) for job in jobs))
     return machine, ServiceShell(
         machine, InProcessNetwork().service("service", "boot"), RecordingSink()
     )
@@ -472,7 +471,7 @@ async def test_a_core_is_yielded_only_to_a_robot_that_awaits_more(
     """Else a robot's next question waits while other programs take this core."""
     machine, both = scripted(("one", 1e-4, lambda: None))
     reply = SendReply(1, b"a part")
-    answers = [[reply, EndCall(1)], machine.runs] if has_all else [[reply, *machine.runs]]
+    answers = [[reply, EndCall(1)], machine.jobs] if has_all else [[reply, *machine.jobs]]
     monkeypatch.setattr(machine, "receive", lambda *_: answers.pop(0))
     yielded: list[int] = []
     monkeypatch.setattr(os, "sched_yield", lambda: yielded.append(len(machine.trace)))
@@ -488,8 +487,8 @@ async def test_a_core_is_yielded_only_to_a_robot_that_awaits_more(
 async def test_jobs_that_cannot_be_computed_together_have_a_turn_each() -> None:
     """Else a service would say nothing while each of them uses up its time."""
     machine, both = scripted(*[("same", 1e-4, lambda: None)] * 3)
-    for run in machine.runs:
-        run.job.company = b"equal"
+    for job in machine.jobs:
+        job.company = b"equal"
     await both.start()
     both.deliver(Call(machine.trace))
     numbers = {0}

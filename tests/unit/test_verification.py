@@ -144,6 +144,16 @@ def test_honest_answers_are_all_the_same_and_cost_no_time() -> None:
     assert not plain.verified
 
 
+def test_questions_that_nobody_answers_any_more_are_forgotten() -> None:
+    world = World(verify_share=1.0)
+    verification = world.dispatcher._verification
+    kept = []
+    world.on_act = lambda _: kept.append(len(verification._own))
+    world.complete()
+    assert len(kept) > 20
+    assert max(kept) <= 2
+
+
 def test_the_share_is_kept_and_no_service_can_tell_which() -> None:
     drawn: dict[bytes, list[bool]] = {}
     for secret in (b"one", b"other"):
@@ -373,9 +383,8 @@ def test_a_part_that_comes_after_the_own_answer_is_compared_as_well() -> None:
 def test_the_robots_own_service_is_not_sampled() -> None:
     verification = Verification(1.0, b"secret", "local", PLANNER, Effects[RobotEffect]())
     for service, sampled in (("local", False), ("cloud", True)):
-        question = question_of(3)
-        answer(verification, question, service)
-        assert question.check_decided == sampled
+        answer(verification, question_of(3), service)
+        assert len(verification) == sampled
 
 
 def test_a_rounding_error_is_no_excess() -> None:

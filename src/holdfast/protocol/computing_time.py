@@ -31,3 +31,7 @@ class ExpectedTime:
         if own_s > self.typical_s:
             own_s = self.typical_s + (own_s - self.typical_s) / _TYPICAL_INERTIA
         self.typical_s = own_s
+
+    def expect_long(self) -> None:
+        """Predict nothing of the next one, which may take any time."""
+        self.typical_s = math.inf

@@ -113,13 +113,14 @@ class Dispatcher(DecisionSource):
 
     def ask(self, question: Question, now: float) -> None:
         """Replace the question."""
-        self.question = question
+        super().ask(question, now)
         self._hedging.earn()
         for call in self._calls:
             # A service that has not answered yet may still do so, and is then known to live; but
             # one that already gave a part has shown that.
             if call.answered:
                 self._calls.abandon(call)
+        self._verification.keep([call.question for call in self._calls])
         self.wake(now)
         if self.stopped_by is None:
             self._try_others(question, now)
@@ -136,13 +137,11 @@ class Dispatcher(DecisionSource):
 
     def handle(self, event: TransportEvent | OwnAnswer | RecoveryExited, now: float) -> None:
         """Handle an event of the transport, the own planner or the local service's process."""
-        if isinstance(event, ReplyReceived):
+        if isinstance(event, ReplyReceived | CallEnded):
             call = self._calls.get(event.call)
-            if call is not None:
+            if call is not None and isinstance(event, ReplyReceived):
                 self._replied(call, event.payload, now)
-        elif isinstance(event, CallEnded):
-            call = self._calls.get(event.call)
-            if call is not None:
+            elif call is not None:
                 self._ended(call, now)
         elif isinstance(event, ServiceAppeared):
             self._appeared(self._services.get(event.service), event.incarnation, now)
@@ -156,9 +155,8 @@ class Dispatcher(DecisionSource):
 
     def recompute(self) -> None:
         """Have the own planner answer the question too."""
-        question = self.question
-        if question is not None:
-            self._verification.check(question)
+        if self.question is not None:
+            self._verification.check(self.question)
 
     @property
     def num_unverified(self) -> int:
@@ -173,7 +171,7 @@ class Dispatcher(DecisionSource):
         due: list[float | None] = []
         if self._calls:
             due += [replica.detector.deadline() for replica in services]
-            due.append(self._calls.first_sent_at() + self._limit_s)
+            due += [call.sent_at + self._limit_s for call in self._calls]
         if question is not None and not question.complete:
             if not self._is_being_asked(question, self._woke_at):
                 due += [
@@ -183,11 +181,11 @@ class Dispatcher(DecisionSource):
                 ]
                 if services.is_starting(self._woke_at):
                     due.append(services.startup_until)
-            elif question.needed_at is not None:
+            elif self.needed_at is not None:
                 due += [self._calls.probe_at(replica, question) for replica in services.cloud]
-                due.append(question.needed_at + self._detection_timeout_s)
-            if question.needed_at is not None and question is not self._reported_wait:
-                due.append(question.needed_at + self._patience_s)
+                due.append(self.needed_at + self._detection_timeout_s)
+            if self.needed_at is not None and question is not self._reported_wait:
+                due.append(self.needed_at + self._patience_s)
             due.append(self._hedge_at(question))
         local = services.local
         if local is not None:
@@ -221,7 +219,7 @@ class Dispatcher(DecisionSource):
         question = self.question
         if self.tracker.is_recovering and question is not None and replica.refusal is None:
             # It need not wait for the next turn: with an answer to this one it holds the state.
-            self._calls.send(replica, question, now, is_retry=False)
+            self._calls.send(replica, question, now)
 
     def _vanished(self, event: ServiceVanished, now: float) -> None:
         replica = self._services.get(event.service)
@@ -262,7 +260,7 @@ class Dispatcher(DecisionSource):
             elif isinstance(reply, NeedState) and not call.has_everything:
                 # Told everything but the state, it came to another one: only the state will do.
                 whole_state = reply.differs or call.opens
-                self._calls.send(replica, question, now, whole_state=whole_state, is_retry=False)
+                self._calls.send(replica, question, now, whole_state=whole_state)
         if is_answer and replica is self._services.local:
             self._launches.succeeded()
         elif is_answer and is_first and self.tracker.is_recovering and replica.reliable:
@@ -331,7 +329,7 @@ class Dispatcher(DecisionSource):
                 self._end_hold(now)
             elif self._is_being_asked(question, now):
                 self._hedge(question, now)
-                if question.needed_at is not None:
+                if self.needed_at is not None:
                     # The service that has the question may be silent for long meanwhile.
                     self._try_others(question, now)
                 self._report_wait(question, now)
@@ -374,27 +372,22 @@ class Dispatcher(DecisionSource):
         if not self.tracker.is_recovering:
             for replica in services.cloud:
                 if replica.usable(now) and not self._calls.is_asked(replica, question):
-                    self._calls.send(replica, question, now)
+                    self._calls.send(replica, question, now, waited_s=self.waited_s(now))
                     return
-            if self._services.is_starting(now):
+            if services.is_starting(now):
                 return
             busy_until = services.busy_until(now)
             if busy_until is not None:
-                since = now if question.needed_at is None else question.needed_at
+                since = now if self.needed_at is None else self.needed_at
                 is_long = busy_until - since > self._detection_timeout_s
-                if not is_long and not self._services.local_usable(now):
+                if not is_long and not services.local_usable(now):
                     return
-        if services.local is None:
-            self._hold_and_retry(question, now)
-            return
-        if not self.tracker.is_recovering:
+        if services.local is not None and not self.tracker.is_recovering:
             self._lose_cloud(now)
-            self._tend_recovery(now)
-        if self._services.local_usable(now):
-            if not self._calls.is_asked(services.local, question):
-                self._calls.send(services.local, question, now)
-            return
-        self._hold_and_retry(question, now)
+        if services.local is None or not services.local_usable(now):
+            self._hold_and_retry(question, now)
+        elif not self._calls.is_asked(services.local, question):
+            self._calls.send(services.local, question, now, waited_s=self.waited_s(now))
 
     def _hold_and_retry(self, question: Question, now: float) -> None:
         """Ask any present service, suspected or not, at growing intervals."""
@@ -406,7 +399,7 @@ class Dispatcher(DecisionSource):
                 and self._calls.retry_at(replica, question) <= now
             ):
                 replica.delay(now)
-                self._calls.send(replica, question, now)
+                self._calls.send(replica, question, now, waited_s=self.waited_s(now))
                 if replica.detector.trusted:
                     return
         if services.all_refuse():
@@ -414,7 +407,7 @@ class Dispatcher(DecisionSource):
                 ServiceRefusedError(f"no service will decide: {services.explain_no_service()}")
             )
             return
-        if question.needed_at is not None and self.holding_since is None:
+        if self.needed_at is not None and self.holding_since is None:
             self.holding_since = now
             reason = services.explain_no_service()
             self.effects.report("holding", step=question.state.step, reason=reason)
@@ -424,19 +417,19 @@ class Dispatcher(DecisionSource):
 
         An answer of a suspected one brings it back.
         """
-        needed_at = question.needed_at
+        needed_at = self.needed_at
         is_late = needed_at is not None and now >= needed_at + self._detection_timeout_s
         for replica in self._services.cloud:
             if replica.usable(now) and not self.tracker.is_recovering:
                 if is_late and not self._calls.is_asked(replica, question):
                     # It has come back while one that is less preferred takes its time.
-                    self._calls.send(replica, question, now, is_retry=False)
+                    self._calls.send(replica, question, now)
                 break
             at = self._calls.probe_at(replica, question)
             if at is not None and at <= now:
                 if self._calls.is_asked(replica, question):
                     replica.delay(now)
-                self._calls.send(replica, question, now, is_retry=False)
+                self._calls.send(replica, question, now)
 
     def _note_lost_cloud(self, now: float) -> None:
         """Start the recovery if the cloud was lost while nothing was asked of it."""
@@ -444,32 +437,32 @@ class Dispatcher(DecisionSource):
             self._services.local is not None
             and not self.tracker.is_recovering
             and not self._services.is_starting(now)
-            and not self._services.any_reliable()
+            and not any(replica.reliable for replica in self._services.cloud)
         ):
             self._lose_cloud(now)
-            self._tend_recovery(now)
 
     def _lose_cloud(self, now: float) -> None:
+        """Start the recovery."""
         reason, silence_s = self._services.why_lost(), self._services.silence_s(now)
         self.effects.report(
             "status", **self.tracker.change(Cause.CLOUD_LOST, reason, now, silence_s)
         )
+        self._tend_recovery(now)
 
     # -- standing still --------------------------------------------------------------------------
 
     def _report_wait(self, question: Question, now: float) -> None:
         """Report, once per question, that a service takes its time while the robot waits."""
-        needed_at = question.needed_at
-        if needed_at is None or question is self._reported_wait:
+        if self.needed_at is None or question is self._reported_wait:
             return
-        if now >= needed_at + self._patience_s:
+        if now >= self.needed_at + self._patience_s:
             self._reported_wait = question
             asked = {call.replica.name for call in self._calls.about(question)}
             self.effects.report(
                 "waiting",
                 service=", ".join(sorted(asked)),
                 step=question.state.step,
-                waited_ms=1e3 * (now - needed_at),
+                waited_ms=1e3 * self.waited_s(now),
             )
 
     def _end_hold(self, now: float) -> None:
@@ -502,7 +495,7 @@ class Dispatcher(DecisionSource):
 
     def _hedge_at(self, question: Question) -> float | None:
         """Return when the local service is asked as well; None if it is not."""
-        local, due = self._services.local, self._hedging.due_at(question)
+        local, due = self._services.local, self._hedging.due_at(self.needed_at)
         if (
             due is None
             or local is None
@@ -517,11 +510,8 @@ class Dispatcher(DecisionSource):
         if local is None or due is None or now < due:
             return
         self._hedging.spend()
-        assert question.needed_at is not None
-        self.effects.report(
-            "hedge", step=question.state.step, waited_ms=1e3 * (now - question.needed_at)
-        )
-        self._calls.send(local, question, now, is_retry=False)
+        self.effects.report("hedge", step=question.state.step, waited_ms=1e3 * self.waited_s(now))
+        self._calls.send(local, question, now)
 
     def _report_suspected(self, replica: Replica) -> None:
         self.effects.report(

@@ -11,7 +11,6 @@ progress, so each later launch gets more time; else it would never come up on a 
 from __future__ import annotations
 
 from holdfast.planning.settings import OffloadSettings, RecoverySettings
-from holdfast.protocol.question import Question
 
 _HEDGING_BURST = 3.0
 """Hedges that may be made at once."""
@@ -129,8 +128,8 @@ class HedgingBudget:
         """Count a hedge."""
         self._budget -= 1.0
 
-    def due_at(self, question: Question) -> float | None:
+    def due_at(self, needed_at: float | None) -> float | None:
         """Return when a question is late; None if it is not awaited, or nothing is left."""
-        if self._deadline_ms is None or question.needed_at is None or self._budget < 1.0:
+        if self._deadline_ms is None or needed_at is None or self._budget < 1.0:
             return None
-        return question.needed_at + 1e-3 * self._deadline_ms
+        return needed_at + 1e-3 * self._deadline_ms

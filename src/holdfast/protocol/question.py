@@ -55,24 +55,10 @@ def same_actions(first: Sequence[FloatArray], second: Sequence[FloatArray]) -> b
     )
 
 
-class WrongAnswer(NamedTuple):
-    """A service's answer that differs from the own planner's."""
-
-    service: str
-    kind: str  # task or sensing
-    step: int  # of the first action that differs
-    # answered, own: the service's action, and the own planner's; of sensing actions with the
-    # state's digest.
-    answered: str
-    own: str
-
-
 class Question:
     """A state in which to decide, and the answer as far as it has arrived.
 
-    The question itself never changes. Its answer is written by its own methods, and what is checked
-    of it by :class:`~holdfast.protocol.verification.Verification`; the robot writes ``needed_at``,
-    ``num_ordered`` and its own actions.
+    The question itself never changes, and only its own methods write its answer.
     """
 
     def __init__(
@@ -93,8 +79,6 @@ class Question:
         # Inputs that a service lacks if it has answered the question before; more if the robot has
         # moved by itself since then, and its moves give observations.
         self.new_inputs = 1
-        # Since when the robot waits for the answer; None if it does not.
-        self.needed_at: float | None = None
         self.num_ordered = 0  # task actions of the answer that are performed or ordered
         # task_actions, sensing: what the robot follows; None until it arrives. Of the actions that
         # it takes itself, those so far.
@@ -103,10 +87,6 @@ class Question:
         self.sensing: SensingAnswer | None = None
         self.task_provenance = Provenance(OWN_PLANNER, 0.0, 0.0) if takes_tasks else None
         self.sensing_provenance: Provenance | None = None
-        self.check_decided = False  # whether a check by the own planner was ordered, or left out
-        self.own: OwnAnswer | None = None  # the own planner's answer
-        # Answers that differ from it, until the own planner has decided a second time.
-        self.differing: list[WrongAnswer] = []
         self._checkpoint: bytes | None = None
         # Step of the answer's sensing action; None if it is too far away.
         self.sensing_step: int | None
@@ -159,6 +139,12 @@ class Question:
             digest = own.ahead_digest[:DIGEST_SIZE]
             answer = SensingAnswer(0, self.sensing_step, own.sensing_action, digest, 0)
             self.follow_sensing(answer, provenance)
+
+    def order(self, offset: int) -> FloatArray:
+        """Return a task action of the answer, which the robot is to order now."""
+        assert self.task_actions is not None
+        self.num_ordered = offset + 1
+        return self.task_actions[offset]
 
     def checkpoint(self) -> bytes:
         """Return the encoded state (computed once)."""
@@ -230,6 +216,8 @@ class DecisionSource:
         # To be carried out in order; the robot appends its own.
         self.effects: Effects[RobotEffect] = Effects()
         self.question: Question | None = None  # the current question, answered or not
+        # Since when the robot waits for its answer; None if it does not.
+        self.needed_at: float | None = None
         self.tracker = StatusTracker()  # which service decides
         # Since when the robot holds still because no service is usable.
         self.holding_since: float | None = None
@@ -245,8 +233,24 @@ class DecisionSource:
         """Begin the run."""
 
     def ask(self, question: Question, now: float) -> None:
-        """Replace the question."""
-        raise NotImplementedError
+        """Replace the question, for whose answer the robot waits unless it acts by itself."""
+        self.question = question
+        self.needed_at = None if question.takes_tasks and question.task_count > 0 else now
+
+    def await_answer(self, now: float) -> None:
+        """Have the robot wait for the rest of the answer."""
+        if self.needed_at is None:
+            self.needed_at = now
+            self.wake(now)
+
+    def end_wait(self, now: float) -> float:
+        """Have the robot wait no more; return for how long it has."""
+        waited_s, self.needed_at = self.waited_s(now), None
+        return waited_s
+
+    def waited_s(self, now: float) -> float:
+        """Return how long the robot has waited for the answer."""
+        return 0.0 if self.needed_at is None else now - self.needed_at
 
     def drop(self) -> None:
         """Drop the question: the trial has ended, or its answer is of no use."""
@@ -288,7 +292,7 @@ class InProcessSource(DecisionSource):
 
     def ask(self, question: Question, now: float) -> None:
         """Ask a new question; the one before is forgotten."""
-        self.question = question
+        super().ask(question, now)
         self._number += 1
         self._asked_at = now
         self._compute("sensing" if question.task_count == 0 else "task", question.state)

@@ -241,10 +241,6 @@ class ReplicaSet:
         """Return whether the local service can be expected to answer now."""
         return self.local is not None and self.local.usable(now)
 
-    def any_reliable(self) -> bool:
-        """Return whether a cloud service is reliable."""
-        return any(replica.reliable for replica in self.cloud)
-
     def busy_until(self, now: float) -> float | None:
         """Return when the first busy cloud service may be asked again; None if none is busy."""
         times = [

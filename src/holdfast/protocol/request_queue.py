@@ -102,6 +102,7 @@ class RequestQueue:
         self._urgent, self._later = _RoundRobin(), _RoundRobin()
         self._patience_s = 1e-3 * limits.prefetch_patience_ms
         self.running: dict[Job, PendingTask] = {}  # tasks that workers have
+        self._started_at: dict[Job, float] = {}  # since when
         # A task that comes while one of its session and slot runs is held back, so that a robot has
         # no more than its turn. Only prefetches that waited together may run together.
         self._running_of: dict[tuple[Session, int], PendingTask] = {}
@@ -176,7 +177,7 @@ class RequestQueue:
             return True
         if len(self.running) >= _MOST_TOGETHER:
             return False
-        running_s = sum(each.short_s for each in self.running.values())
+        running_s = sum(job.expected_s for job in self.running)
         return running_s + task.predicted_s(task.starts_at()) <= _TOGETHER_S
 
     def _next(self) -> PendingTask | None:
@@ -199,30 +200,21 @@ class RequestQueue:
     def handed_out(self, task: PendingTask, job: Job, now: float) -> None:
         """Note that a worker has a task."""
         task.running = True
-        task.started_at = now
         self._running_of[task.session, task.slot] = task
         self.running[job] = task
-
-    @property
-    def running_bytes(self) -> float:
-        """Estimated memory of all running tasks."""
-        return sum(task.num_bytes for task in self.running.values())
-
-    def job_of(self, task: PendingTask) -> Job:
-        """Return the job of a running task."""
-        return next(job for job, other in self.running.items() if other is task)
+        self._started_at[job] = now
 
     def started(self, job: Job, now: float) -> None:
         """Note that a worker starts its task only now."""
-        self.running[job].started_at = now
+        self._started_at[job] = now
 
-    def end(self, job: Job) -> PendingTask:
-        """Note that a worker is free; return its task."""
+    def end(self, job: Job) -> tuple[PendingTask, float]:
+        """Note that a worker is free; return its task, and when it was started."""
         task = self.running.pop(job)
         task.running = False
         # Two prefetches that waited together run together; the first end frees the slot.
         self._running_of.pop((task.session, task.slot), None)
-        return task
+        return task, self._started_at.pop(job)
 
     def release_held(self, session: Session) -> None:
         """Queue a session's tasks that were held back behind those that have run."""
@@ -267,7 +259,8 @@ class RequestQueue:
         These are those that run, the owner's own, and of each other owner as many, and one more.
         """
         running_s = sum(
-            max(0.0, task.cost_s - (now - task.started_at)) for task in self.running.values()
+            max(0.0, task.cost_s - (now - self._started_at[job]))
+            for job, task in self.running.items()
         )
         whole, own = self.waiting, self._waiting_of.get(owner)
         if own is not None and len(self._waiting_of) == 1:

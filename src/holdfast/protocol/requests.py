@@ -165,10 +165,6 @@ class OpenRequests:
         probes = [call.sent_at for call in self.to(replica) if not call.answered]
         return max(replica.retry_at, max(probes, default=-1e9) + self._detection_timeout_s)
 
-    def first_sent_at(self) -> float:
-        """Return when the oldest open request was sent."""
-        return next(iter(self._open.values())).sent_at
-
     def settle(self, call: OpenRequest) -> None:
         """Close a request from which nothing is awaited."""
         if self._open.pop(call.call_number, None) is not None:
@@ -191,8 +187,9 @@ class OpenRequests:
         now: float,
         *,
         whole_state: bool = False,  # whether the service needs the whole state
-        # Whether another attempt at a question is reported; not if other services have it too.
-        is_retry: bool = True,
+        # For how long the robot has waited, to report another attempt at the question; None if
+        # other services have it too.
+        waited_s: float | None = None,
     ) -> None:
         """Send a question to a service, with the state information that the service lacks."""
         open_calls = self.to(replica)
@@ -226,8 +223,7 @@ class OpenRequests:
             )
         self._attempts = self._attempts + 1 if question is self._asked else 1
         self._asked = question
-        if self._attempts > 1 and is_retry:
-            waited_s = 0.0 if question.needed_at is None else now - question.needed_at
+        if self._attempts > 1 and waited_s is not None:
             self._effects.report(
                 "retry",
                 service=replica.name,

@@ -85,7 +85,6 @@ class Robot:
         # One list for both, because the order of all effects counts.
         self._effects = source.effects
         self._history: Trial | None = None
-        self._trial = 0
         self._ending: Ending | None = None
         self._lost_at: int | None = None
         self._awaits_environment = False
@@ -120,12 +119,7 @@ class Robot:
     @property
     def trial(self) -> int | None:
         """The current trial; None between trials."""
-        return None if self._history is None else self._trial
-
-    @property
-    def step(self) -> int | None:
-        """The current step; None between trials."""
-        return None if self._history is None else self._history.state.step
+        return None if self._history is None else self._history.state.trial
 
     @property
     def state(self) -> PlanningState | None:
@@ -149,7 +143,6 @@ class Robot:
 
     def begin_trial(
         self,
-        trial: int,
         # From :func:`~holdfast.planning.tracking.replay`; of no records for a new trial.
         history: Trial,
         begun: EnvironmentReady,
@@ -159,7 +152,6 @@ class Robot:
         tail_is_certain: bool,
     ) -> list[RobotEffect]:
         """Begin or resume a trial."""
-        self._trial = trial
         self._history = history
         self._ending = begun.ending
         self._lost_at = None
@@ -168,7 +160,7 @@ class Robot:
         self._next_tick = None
         resumed = history.begun
         if resumed:
-            self._effects.report("resumed_trial", trial=trial, step=history.state.step)
+            self._effects.report("resumed_trial", trial=self.trial, step=history.state.step)
         try:
             if history.is_lost and history.pending is None and self._lost.on_lost == "reinitialise":
                 # The process ended between the observation and this, or held still there.
@@ -195,7 +187,7 @@ class Robot:
         """Return the pending task action if it was not performed and must be performed now."""
         history, performed = self._current_history, begun.steps_performed
         known = history.state.step
-        where = f"trial {self._trial}, step {history.state.step}"
+        where = f"trial {history.state.trial}, step {history.state.step}"
         if performed is None:
             if not resumed or (history.pending is None and (history.paused or tail_is_certain)):
                 return None
@@ -211,7 +203,7 @@ class Robot:
                 "trial anew in another directory (--out)"
             )
         if history.pending is not None and performed == known + 1:
-            self._effects.report("performed_unseen", trial=self._trial, step=known)
+            self._effects.report("performed_unseen", trial=self.trial, step=known)
             self._fold_move(begun.last or Moved(known, None))
             return None
         if performed != known:
@@ -359,30 +351,25 @@ class Robot:
         self._judge(late.taken, of="late")
 
     def _failed(self, event: EnvironmentFailed) -> None:
-        where = f"the robot holds still in trial {self._trial}, step {event.step}"
+        where = f"the robot holds still in trial {self.trial}, step {event.step}"
         if event.performed is not None:
             # What is written down now needs no environment that counts when the run goes on.
             self._performed(event.performed)
             if self._source.stopped_by is not None:
                 return
             where += ", whose task action was performed"
+        kind: type[HoldfastError] = HeldError
+        if event.action_in_doubt and event.counts_steps:
+            where += ", and whether its task action was performed is not known"
+        elif event.action_in_doubt:
+            kind = UnknownPerformanceError
+            where += (
+                ", and nobody can say whether its task action was performed, because the "
+                "environment has no method steps_performed; this trial cannot be gone on with, "
+                "since no action must be performed twice"
+            )
         # The account of the failure comes last: it may have many lines.
-        if not event.action_in_doubt:
-            self._source.stop(HeldError(f"{where}: {event.text}"))
-        elif event.counts_steps:
-            self._source.stop(
-                HeldError(
-                    f"{where}, and whether its task action was performed is not known: {event.text}"
-                )
-            )
-        else:
-            self._source.stop(
-                UnknownPerformanceError(
-                    f"{where}, and nobody can say whether its task action was performed, because "
-                    "the environment has no method steps_performed; this trial cannot be gone on "
-                    f"with, since no action must be performed twice: {event.text}"
-                )
-            )
+        self._source.stop(kind(f"{where}: {event.text}"))
 
     # -- the loop --------------------------------------------------------------------------------
 
@@ -414,24 +401,22 @@ class Robot:
         question = self._question()
         if question is None or question.sensing_step != state.step:
             question = self._ask(self._planner.digest(state), now)
-        answer = question.sensing
-        if answer is None:
-            self._await_answer(now)
+        answer, provenance = question.sensing, question.sensing_provenance
+        if answer is None or provenance is None:
+            self._source.await_answer(now)
             return
         if (
             question.state is not state
             and answer.digest != self._planner.digest(state)[:DIGEST_SIZE]
         ):
             # Chosen for another state than this: the service's belief has drifted from ours.
-            self._effects.report("prefetch_unused", trial=self._trial, step=state.step)
+            self._effects.report("prefetch_unused", trial=self.trial, step=state.step)
             self._source.recompute()
             self._ask(self._planner.digest(state), now)
-            self._await_answer(now)
+            self._source.await_answer(now)
             return
-        provenance = question.sensing_provenance
-        assert provenance is not None
         self._computed_ms = 1e3 * provenance.computed_s
-        self._timed("sensing", question, provenance, now)
+        self._timed("sensing", state, provenance, now)
         self._sensing_action = answer.sensing_action
         if answer.sensing_action == self._planner.no_sensing:
             self._sensed(Sensed(state.step, answer.sensing_action, b""), now)
@@ -449,28 +434,26 @@ class Robot:
             offset = 0
             if self._source.stopped_by is not None:
                 return
-        actions = question.task_actions
-        if actions is None:
-            self._await_answer(now)
+        actions, provenance = question.task_actions, question.task_provenance
+        if actions is None or provenance is None:
+            self._source.await_answer(now)
             return
         if offset == len(actions):
             try:
-                actions.append(self._planner.choose_task_action(state)[0])
+                own = self._planner.choose_task_action(state)[0]
             except HoldfastError as error:
                 self._source.stop(error)
                 return
-        provenance = question.task_provenance
-        if offset == 0 and provenance is not None and provenance is not self._timed_provenance:
+            question.follow_tasks([*actions, own], provenance)
+        if offset == 0 and provenance is not self._timed_provenance:
             self._timed_provenance = provenance
-            self._timed("task", question, provenance, now)
-        question.needed_at = None
+            self._timed("task", state, provenance, now)
         if not self._take_tick(now):
             return
-        action = actions[offset]
+        action = question.order(offset)
         self._write(ActingRecord(state.step, encode_floats(action)))
         history = self._current_history
         history.pending = action
-        question.num_ordered = offset + 1
         self._awaits_environment = True
         self._effects.append(Act(state.step, action))
 
@@ -491,17 +474,8 @@ class Robot:
             history.num_inputs,
             self._source.takes_tasks,
         )
-        if not question.takes_tasks or question.task_count == 0:
-            question.needed_at = now
         self._source.ask(question, now)
         return question
-
-    def _await_answer(self, now: float) -> None:
-        """Wait for the rest of the answer."""
-        question = self._source.question
-        if question is not None and question.needed_at is None:
-            question.needed_at = now
-            self._source.wake(now)
 
     def _take_tick(self, now: float) -> bool:
         """Return whether the next task action is due, and take its tick; else set the wakeup."""
@@ -547,9 +521,9 @@ class Robot:
             # A recovery alone does not begin a trial.
             self._count_recoveries()
         self._unwritten += records
-        if self._unwritten:
+        if self._unwritten and history is not None:
             # The effects that follow may rest on these records.
-            self._effects.append(WriteRecords(self._trial, tuple(self._unwritten)))
+            self._effects.append(WriteRecords(history.state.trial, tuple(self._unwritten)))
             self._unwritten = []
 
     def _count_recoveries(self) -> None:
@@ -561,18 +535,16 @@ class Robot:
             history.recoveries += times
             self._unwritten.append(LocalTookOverRecord(times))
 
-    def _timed(self, kind: str, question: Question, provenance: Provenance, now: float) -> None:
+    def _timed(self, kind: str, state: PlanningState, provenance: Provenance, now: float) -> None:
         self.has_decided = True
-        waited_s = 0.0 if question.needed_at is None else now - question.needed_at
-        step = question.state.step if kind == "task" else question.sensing_step
         self._effects.append(
             Timing(
-                self._trial,
-                step if step is not None else question.state.step,
+                state.trial,
+                state.step,
                 kind,
                 provenance.service,
                 self._source.tracker.status.value,
-                1e3 * waited_s,
+                1e3 * self._source.end_wait(now),
                 1e3 * provenance.round_trip_s,
                 1e3 * provenance.computed_s,
             )

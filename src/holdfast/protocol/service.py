@@ -43,7 +43,6 @@ from holdfast.protocol.service_jobs import (
     JobResult,
     ProblemPool,
     ServiceEffect,
-    StartJob,
 )
 from holdfast.protocol.service_lanes import Lanes
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
@@ -109,9 +108,8 @@ class Service:
         self._calls = WaitingCalls(self._limits, self._statistics, self._effects)
         # Of results whose replies are on their way first.
         self._settling: list[Session] = []
-        # Of all robots; each session has its own, which begin here.
-        self._task_time = ExpectedTime(1e-3)
-        self._sensing_time = ExpectedTime(1e-3)
+        # Of all robots' task and sensing parts; each session has its own, which begin here.
+        self._times = ExpectedTime(1e-3), ExpectedTime(1e-3)
 
     @property
     def max_running(self) -> int:
@@ -160,12 +158,12 @@ class Service:
         lane = self._queue.with_job(job)
         if lane is None:
             return []  # handed out before everything was forgotten
-        task = lane.end(job)
+        task, started_at = lane.end(job)
         session = task.session
         is_awaited = session.pending.get(task.digest) is task
         session.remove_task(task)
         price = outcome.price
-        if task.short_s == math.inf:
+        if job.expected_s == math.inf:
             self._problems.release(session.problem_key, outcome.problem)
         cost = None if price is None else price.problem
         self._problems.note_cost(session.owner, session.problem_key, cost)
@@ -179,29 +177,30 @@ class Service:
             session.price = price or session.price
             if outcome.cancelled or outcome.postponed is not None:
                 if is_awaited:
-                    self._postpone(task, outcome.postponed, now)
+                    self._postpone(task, job, outcome.postponed, now)
             elif outcome.failure is not None or outcome.lacks_state:
                 self._failed(task, outcome)
             else:
-                computed_s = now - task.started_at
+                computed_s = now - started_at
                 session.overran = session.overran and computed_s > self._queue.limits_s[MEDIUM]
                 if outcome.restored:
                     # A particle in an obstacle, say, takes a thousand times as long to move.
-                    session.task_time.typical_s = math.inf
+                    session.times[False].expect_long()
                 if typical and task.lane <= BRIEF:
                     # What new robots are expected to take.
-                    (self._sensing_time if task.sensing else self._task_time).learn(computed_s)
+                    self._times[task.sensing].learn(computed_s)
                 if typical or outcome.restored:
                     task.expected_time.learn(computed_s, processor_s)
-                    self._sessions.alike(session).learn(task.sensing, computed_s, processor_s)
-                self._succeeded(task, outcome, now)
+                    common = self._sessions.alike(session).times[task.sensing]
+                    common.learn(computed_s, processor_s)
+                self._succeeded(task, outcome, started_at, now)
             self._settling.append(session)
         return self._effects.take()
 
     def gone(self, call: int) -> list[ServiceEffect]:
         """Handle the end of a call by itself: its link has ended, and nobody awaits replies."""
         task = self._calls.drop(call)
-        if task is not None and not task.calls:
+        if task is not None:
             self._statistics.superseded += self._queue.drop(task)
         return self._effects.take()
 
@@ -293,13 +292,9 @@ class Service:
             )
             self._calls.send_refused(call, request.number, "invalid", text)
             return None
-        session = Session(
-            key,
-            request,
-            configuration,
-            ExpectedTime(self._task_time.mean_s, _INERTIA_OF_ONE),
-            ExpectedTime(self._sensing_time.mean_s, _INERTIA_OF_ONE),
-        )
+        task_s, sensing_s = (time.mean_s for time in self._times)
+        times = ExpectedTime(task_s, _INERTIA_OF_ONE), ExpectedTime(sensing_s, _INERTIA_OF_ONE)
+        session = Session(key, request, configuration, times)
         session.known = self._problems.cost_of(session.owner, session.problem_key)
         self._sessions.alike(session).share_with(session)
         lane = session.lane_of(request)
@@ -438,7 +433,7 @@ class Service:
             state is None
             and request is not None
             and request.checkpoint is None
-            and session.knows_trial(request.trial)
+            and session.states_of(request.trial)
         ):
             # The robot is behind what is remembered, or was elsewhere meanwhile.
             session.remove_task(task)
@@ -447,12 +442,12 @@ class Service:
             return
         alone = self._queue.is_alone(task)
         estimated_s = self._queue.limits_s[task.lane]
-        task.short_s = task.predicted_s(state)
-        is_short = task.short_s < math.inf
+        expected_s = task.predicted_s(state)
+        is_short = expected_s < math.inf
         problems = self._problems
         problem = (problems.shared if is_short else problems.acquire)(session.problem_key)
         if problem is None:
-            task.short_s = math.inf
+            expected_s = math.inf
         job = Job(
             task.kind,
             problem,
@@ -468,20 +463,23 @@ class Service:
             session.price,
             session.known,
             None if task.lane == LONG else Cost(estimated_s, self._limits.max_medium_bytes),
-            self._queue.most_s(task),
+            self._queue.most_s(task.lane, expected_s),
             # A long one would have to build it again.
             building_counts=task.lane != LONG,
             company=session.company,
+            expected_s=expected_s,
+            is_brief=task.lane <= BRIEF,
         )
         self._queue[task.lane].handed_out(task, job, now)
-        self._effects.append(StartJob(job, task.short_s, task.lane <= BRIEF))
+        self._effects.append(job)
 
     # -- outcomes --------------------------------------------------------------------------------
 
-    def _postpone(self, task: PendingTask, cost: Cost | None, now: float) -> None:
+    def _postpone(self, task: PendingTask, job: Job, cost: Cost | None, now: float) -> None:
         """Queue a task again that takes more than its lane allows."""
+        awaited = self._calls.is_awaited(task)
         try:
-            has_room = self._queue.postpone(task, cost, now)
+            has_room = self._queue.postpone(task, job, cost, now, awaited=awaited)
         except MessageError as error:
             for record in self._calls.detach(task):
                 self._calls.send_refused(record.call, record.number, error.code, str(error))
@@ -498,7 +496,7 @@ class Service:
             self._note("state_diverged", session, trial=request.trial, step=request.step)
         if outcome.failure is not None:
             # Together with others it would fail for all: the next one is on a thread.
-            task.expected_time.typical_s = math.inf
+            task.expected_time.expect_long()
         for record in self._calls.detach(task):
             if outcome.failure is None:
                 self._calls.send_need_state(
@@ -510,11 +508,13 @@ class Service:
             # There is nothing to keep: whoever asks again sends all of it.
             self._forget(session, "refused")
 
-    def _succeeded(self, task: PendingTask, outcome: JobResult, now: float) -> None:
+    def _succeeded(
+        self, task: PendingTask, outcome: JobResult, started_at: float, now: float
+    ) -> None:
         session, statistics = task.session, self._statistics
         self._sessions.mark_served(session)
         most = self._limits.answers_per_session
-        computed_s = now - task.started_at
+        computed_s = now - started_at
         computed_us = min(MAX_WORD, max(0, round(1e6 * computed_s)))
         if outcome.state is not None:
             session.acknowledged = outcome.state
@@ -526,7 +526,7 @@ class Service:
         state = task.state if outcome.state is None else outcome.state
         assert state is not None
         where = (state.trial, state.step, state.sensed, computed_us)
-        self._effects.append(Computed(task.kind, computed_s, task.started_at - task.since))
+        self._effects.append(Computed(task.kind, computed_s, started_at - task.since))
         if task.sensing:
             statistics.sensing_parts += 1
             answer = CachedAnswer(*where, sensing_action=outcome.sensing_action)
@@ -549,7 +549,7 @@ class Service:
             self._calls.end(task)
         elif following in session.answers:
             self._send_sensing(task, following, session.answers[following])
-        elif task.calls:
+        elif self._calls.is_awaited(task):
             # Without a waiting call the robot has moved on.
             rest = session.pending.get(following) or self._prefetch(session, now)
             self._calls.move(task, rest)

@@ -92,7 +92,11 @@ class _LacksStateError(Exception):
 
 
 class Job:
-    """A part of an answer to be computed."""
+    """A part of an answer to be computed anywhere; its result is handed to ``Service.finished``.
+
+    Short jobs are run one after another, or together
+    (:func:`~holdfast.protocol.service_batches.run_together`): they share their problem.
+    """
 
     def __init__(
         self,
@@ -119,9 +123,17 @@ class Job:
         building_counts: bool = False,
         # The same for jobs of the same problem and settings; None: like no other.
         company: bytes | None = None,
+        # How long a short job takes; infinite for one that takes long or that nothing predicts: the
+        # first job, a problem that is not built in, or an unusual request.
+        expected_s: float = math.inf,
+        # Whether its lane ends it after a moment. All others may take any time, so their threads
+        # have less weight (:class:`~holdfast.protocol.service_lanes.Lanes`).
+        is_brief: bool = False,
     ) -> None:
         self.kind = kind
         self.company = company
+        self.expected_s = expected_s
+        self.is_brief = is_brief
         self._pricing = pricing
         self.price = price
         self._known = known
@@ -157,11 +169,6 @@ class Job:
     def is_like(self, other: Job) -> bool:
         """Return whether another job asks the same of the same problem and settings."""
         return self.company is not None and (self.kind, self.company) == (other.kind, other.company)
-
-    @property
-    def is_cancelled(self) -> bool:
-        """Whether it is to end."""
-        return self.interruption.is_set
 
     def cancel(self) -> None:
         """End it as soon as it can be; from any thread."""
@@ -434,22 +441,6 @@ class EndCall(NamedTuple):
     call: int
 
 
-class StartJob(NamedTuple):
-    """Run a job anywhere, and hand its result to the machine's ``finished``.
-
-    Short jobs are run one after another, or together
-    (:func:`~holdfast.protocol.service_batches.run_together`): they share their problem.
-    """
-
-    job: Job
-    # Time of a short job; infinite for one that takes long or that nothing predicts: the first job,
-    # a problem that is not built in, or an unusual request.
-    expected_s: float
-    # Whether its lane ends it after a moment. All others may take any time, so their threads have
-    # less weight (:class:`~holdfast.protocol.service_lanes.Lanes`).
-    is_brief: bool
-
-
 class Computed(NamedTuple):
     """Time that a part of an answer took; for metrics only."""
 
@@ -458,4 +449,4 @@ class Computed(NamedTuple):
     waited_s: float  # before it was begun
 
 
-ServiceEffect: TypeAlias = SendReply | EndCall | StartJob | Computed | LogEvent
+ServiceEffect: TypeAlias = SendReply | EndCall | Job | Computed | LogEvent

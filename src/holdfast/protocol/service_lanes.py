@@ -85,11 +85,11 @@ class Lanes:
             return True  # no other long one runs beside it
         return not any(lane.running or lane.waiting.num for lane in self._lanes)
 
-    def most_s(self, task: PendingTask) -> float:
-        """Return how long a job of a task may compute."""
-        if task.short_s < math.inf:
+    def most_s(self, lane: int, expected_s: float = math.inf) -> float:
+        """Return how long a job may compute; ``expected_s`` if it is a short one."""
+        if expected_s < math.inf:
             return _OVERRUN * SHORT_S
-        return (_OVERDUE if task.lane == LONG else _OVERRUN) * self.limits_s[task.lane]
+        return (_OVERDUE if lane == LONG else _OVERRUN) * self.limits_s[lane]
 
     def release_held(self, session: Session) -> None:
         """Queue a session's tasks that were held back behind those that have run."""
@@ -105,7 +105,8 @@ class Lanes:
                 continue
             room_bytes = math.inf
             if number == LONG and lane.running:
-                room_bytes = self._limits.max_decision_bytes - lane.running_bytes
+                taken_bytes = sum(task.num_bytes for task in lane.running.values())
+                room_bytes = self._limits.max_decision_bytes - taken_bytes
             if (task := lane.take(now, room_bytes)) is not None:
                 return task
         return None
@@ -119,7 +120,9 @@ class Lanes:
         task.session.pending[task.digest] = task
         self[task.lane].enqueue(task)
 
-    def postpone(self, task: PendingTask, cost: Cost | None, now: float) -> bool:
+    def postpone(
+        self, task: PendingTask, job: Job, cost: Cost | None, now: float, *, awaited: bool
+    ) -> bool:
         """Queue a task again in another lane, if a call waits for it; return whether there is room.
 
         It has taken longer than estimated if there is no ``cost``. (A prefetch has always room, at
@@ -129,22 +132,22 @@ class Lanes:
         if cost is None and task.lane == LONG:
             raise MessageError(
                 "invalid",
-                f"a decision that has taken {self.most_s(task):.0f} s: this service expected less "
+                f"a decision that has taken {self.most_s(LONG):.0f} s: this service expected less "
                 f"and takes at most {limits.max_decision_s:g} s (--max-decision-s). It has "
                 f"{describe_cost(None, session.planning)}",
             )
-        if cost is None and task.short_s < math.inf:
+        if cost is None and job.expected_s < math.inf:
             # It blocks nobody on a thread, and its next ones go there until one is short again.
-            task.expected_time.typical_s = math.inf
-            if task.calls:
+            task.expected_time.expect_long()
+            if awaited:
                 self.enqueue(task)
             return True
         session.is_brief = False
         if cost is None:
             session.overran = True
             cost = Cost(math.inf, max(task.num_bytes, float(limits.max_medium_bytes)))
-        if not task.calls:
-            return True  # nobody awaits it
+        if not awaited:
+            return True
         fits = cost.seconds <= limits.max_medium_s and cost.num_bytes <= limits.max_medium_bytes
         task.move_to(MEDIUM if fits else LONG, cost)
         if task.slot == REQUESTED and self[task.lane].is_overloaded(now, session.owner):
@@ -164,7 +167,8 @@ class Lanes:
             if task.lane == LONG:
                 # Further calls that ask for the same do not wait for this one.
                 task.session.remove_task(task)
-                self[task.lane].job_of(task).cancel()
+                running = self[LONG].running.items()
+                next(job for job, other in running if other is task).cancel()
             return False
         task.session.remove_task(task)
         self[task.lane].remove(task)

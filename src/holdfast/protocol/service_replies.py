@@ -26,7 +26,7 @@ from holdfast.protocol.messages import (
 )
 from holdfast.protocol.service_jobs import EndCall, SendReply, ServiceEffect
 from holdfast.protocol.service_limits import ServiceLimits, ServiceStatistics
-from holdfast.protocol.service_sessions import CachedAnswer, PendingTask, WaitingCall
+from holdfast.protocol.service_sessions import CachedAnswer, PendingTask
 
 _PROGRESS_TOGETHER = 0.8
 """Calls this far into the interval get their progress together with those due: fewer wakeups."""
@@ -36,6 +36,16 @@ _FEW_CALLS = 64
 
 _RETRY_SPREAD = 0.25
 """Robots are told to retry up to this share later, each by its own amount."""
+
+
+class WaitingCall:
+    """A call (one request of a robot) that waits for a task, and when it got its last reply."""
+
+    def __init__(self, call: int, number: int, task: PendingTask, last_sign_at: float) -> None:
+        self.call = call
+        self.number = number
+        self.task = task
+        self.last_sign_at = last_sign_at
 
 
 class WaitingCalls:
@@ -50,34 +60,36 @@ class WaitingCalls:
         self._effects = effects
         # No sign for the longest first.
         self._calls: OrderedDict[int, WaitingCall] = OrderedDict()
+        self._of: dict[PendingTask, dict[int, WaitingCall]] = {}
 
     def __len__(self) -> int:
         return len(self._calls)
 
     # -- calls that wait -------------------------------------------------------------------------
 
+    def is_awaited(self, task: PendingTask) -> bool:
+        """Return whether a call waits for a task."""
+        return task in self._of
+
     def attach(self, task: PendingTask, call: int, number: int, now: float) -> None:
         """Let a call wait for a task."""
-        record = WaitingCall(call, number, task, now)
-        self._calls[call] = record
-        task.calls[call] = record
-        if len(task.calls) > self._max_calls:
-            oldest = next(iter(task.calls))
-            del task.calls[oldest], self._calls[oldest]
+        calls = self._of.setdefault(task, {})
+        calls[call] = self._calls[call] = WaitingCall(call, number, task, now)
+        if len(calls) > self._max_calls:
+            oldest = next(iter(calls))
+            del calls[oldest], self._calls[oldest]
             self._effects.append(EndCall(oldest))
 
     def move(self, task: PendingTask, rest: PendingTask) -> None:
         """Let the calls of one task wait for another."""
-        calls = list(task.calls.values())
-        task.calls.clear()
-        for record in calls:
+        calls = self._of.pop(task)
+        for record in calls.values():
             record.task = rest
-            rest.calls[record.call] = record
+        self._of.setdefault(rest, {}).update(calls)
 
     def detach(self, task: PendingTask) -> list[WaitingCall]:
         """Remove and return the calls of a task; the caller ends them."""
-        detached = list(task.calls.values())
-        task.calls.clear()
+        detached = list(self._of.pop(task, {}).values())
         for record in detached:
             del self._calls[record.call]
         return detached
@@ -87,18 +99,21 @@ class WaitingCalls:
         self._effects += [EndCall(record.call) for record in self.detach(task)]
 
     def drop(self, call: int) -> PendingTask | None:
-        """Remove a call that has ended by itself; return its task, None if it waits for none."""
+        """Remove a call that has ended by itself; return its task if no other waits for that."""
         record = self._calls.pop(call, None)
         if record is None:
             return None
-        del record.task.calls[call]
+        del self._of[record.task][call]
+        if self._of[record.task]:
+            return None
+        del self._of[record.task]
         return record.task
 
     # -- replies to calls that go on -------------------------------------------------------------
 
     def send_task_to_all(self, task: PendingTask, answer: CachedAnswer, now: float) -> None:
         """Send a task part to all calls of a task."""
-        for record in task.calls.values():
+        for record in self._of.get(task, {}).values():
             self._reply(record, _task_answer(record.number, answer), now)
 
     def send_progress(self, now: float) -> None:

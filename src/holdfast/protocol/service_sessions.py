@@ -8,8 +8,8 @@ A session belongs to an *owner*: the name in the robot's verified certificate, N
 without one. Sessions are found by owner and session id together, so the same id from another owner
 is another session, and nothing is revealed. If room is short, the largest owners lose sessions.
 
-A session also lists its pending tasks: parts of answers that wait or run, with their waiting
-calls. A part is identified by the digest of its state, so equal questions share one task.
+A session also lists its pending tasks: parts of answers that wait or run. A part is identified by
+the digest of its state, so equal questions share one task.
 """
 
 from __future__ import annotations
@@ -74,23 +74,8 @@ class CachedAnswer(NamedTuple):
     sensing_action: int = -1
 
 
-class WaitingCall:
-    """A call (one request of a robot) that waits for a task, and when it got its last reply."""
-
-    def __init__(self, call: int, number: int, task: PendingTask, last_sign_at: float) -> None:
-        self.call = call
-        self.number = number
-        self.task = task
-        self.last_sign_at = last_sign_at
-
-
 class PendingTask:
-    """A part of an answer to be computed, and the calls that wait for it.
-
-    The service creates and drops tasks; :class:`RequestQueue` writes ``urgent``, ``running`` and
-    ``started_at``, and has a waiting task carry a newer request; :class:`WaitingCalls` writes
-    ``calls``.
-    """
+    """A part of an answer to be computed; only the lanes, where it waits and runs, write it."""
 
     def __init__(
         self,
@@ -114,14 +99,11 @@ class PendingTask:
         self.since = since
         self.slot = PREFETCHED if request is None else REQUESTED
         self.urgent = request is not None
-        self.calls: dict[int, WaitingCall] = {}
         # Where it waits and runs (:mod:`~holdfast.protocol.service_lanes`).
         self.lane = session.lane_of(request)
         self.num_bytes = 0.0  # estimated memory, unless it is brief
         self.cost_s = self._expected_s()
         self.running = False
-        self.short_s = math.inf  # how long a short one is expected to run
-        self.started_at = since
 
     @property
     def kind(self) -> Literal["task", "sensing"]:
@@ -131,14 +113,14 @@ class PendingTask:
     @property
     def expected_time(self) -> ExpectedTime:
         """Learned from earlier ones of its session and kind."""
-        return self.session.sensing_time if self.sensing else self.session.task_time
+        return self.session.times[self.sensing]
 
     def _expected_s(self) -> float:
         """Return how long it may take, with the sensing part that follows a task part."""
-        session = self.session
-        mean_s = session.sensing_time.mean_s + (0.0 if self.sensing else session.task_time.mean_s)
+        task_time, sensing_time = self.session.times
+        mean_s = sensing_time.mean_s + (0.0 if self.sensing else task_time.mean_s)
         # One that may be too long for its lane is only estimated there.
-        is_computed = self.lane > BRIEF or session.is_brief
+        is_computed = self.lane > BRIEF or self.session.is_brief
         return mean_s if is_computed else _ESTIMATING_S
 
     def move_to(self, lane: int, cost: Cost) -> None:
@@ -190,18 +172,14 @@ class Alike:
     def __init__(self, session: Session) -> None:
         self.planning = session.planning
         self.single_core = session.single_core
-        # How long their decisions take, whoever's they are.
-        self._task_time, self._sensing_time = ExpectedTime(), ExpectedTime()
-
-    def learn(self, sensing: bool, computed_s: float, processor_s: float | None) -> None:
-        """Include the time of one decision."""
-        (self._sensing_time if sensing else self._task_time).learn(computed_s, processor_s)
+        # How long their task and sensing parts take, whoever's they are.
+        self.times = ExpectedTime(), ExpectedTime()
 
     def share_with(self, session: Session) -> None:
         """Give a new session what is known: the same objects need no further check."""
         session.planning, session.single_core = self.planning, self.single_core
-        session.task_time.typical_s = self._task_time.typical_s
-        session.sensing_time.typical_s = self._sensing_time.typical_s
+        for time, common in zip(session.times, self.times, strict=True):
+            time.typical_s = common.typical_s
 
 
 class Session:
@@ -217,8 +195,7 @@ class Session:
         key: SessionKey,
         request: Request,
         configuration: SessionConfiguration,
-        task_time: ExpectedTime,
-        sensing_time: ExpectedTime,
+        times: tuple[ExpectedTime, ExpectedTime],  # of its task and sensing parts
     ) -> None:
         self.key = key
         self.owner = key[0]
@@ -265,8 +242,7 @@ class Session:
         # the digest of their state.
         self.answers: OrderedDict[bytes, CachedAnswer] = OrderedDict()
         self.pending: dict[bytes, PendingTask] = {}
-        self.task_time = task_time
-        self.sensing_time = sensing_time
+        self.times = times
         self.num_bytes = 0  # counted size of states and answers
         self.used_at = 0.0  # time of the last request or result
         self.closed = False
@@ -299,20 +275,13 @@ class Session:
     def state_before(self, request: Request) -> PlanningState | None:
         """Return the nearest state before the request's; None if there is none."""
         asked = request.step, request.sensed
-        for known in self._states():
-            if known is None or known.trial != request.trial:
-                continue
-            if (known.step, known.sensed) <= asked:
-                return known
-        return None
+        states = self.states_of(request.trial)
+        return next((each for each in states if (each.step, each.sensed) <= asked), None)
 
-    def knows_trial(self, trial: int) -> bool:
-        """Return whether a state of the trial is held."""
-        return any(known is not None and known.trial == trial for known in self._states())
-
-    def _states(self) -> tuple[PlanningState | None, ...]:
-        """Return the states from which it may go on, the later first."""
-        return () if self.acknowledged is None else (self.ahead, self.acknowledged)
+    def states_of(self, trial: int) -> list[PlanningState]:
+        """Return the states from which a trial may go on, the later first."""
+        held = () if self.acknowledged is None else (self.ahead, self.acknowledged)
+        return [each for each in held if each is not None and each.trial == trial]
 
     def size(self) -> int:
         """Return the bytes of its states and answers."""
@@ -443,10 +412,11 @@ class SessionTable:
 
     def has_room_for(self, session: Session) -> bool:
         """Return whether a session fits without dropping another; the only one always fits."""
+        configuration_bytes = self.configuration_bytes + len(session.configuration)
         return not self._sessions or not (
             self._is_full_for(session.owner)
             or self._is_full
-            or self._lacks_room_for_configuration(session)
+            or configuration_bytes > self._limits.max_configuration_bytes
         )
 
     def evictable_for(self, session: Session) -> Session | None:
@@ -470,12 +440,6 @@ class SessionTable:
     @property
     def _is_full(self) -> bool:
         return len(self._sessions) >= self._limits.max_sessions
-
-    def _lacks_room_for_configuration(self, session: Session) -> bool:
-        return (
-            self.configuration_bytes + len(session.configuration)
-            > self._limits.max_configuration_bytes
-        )
 
     def _unused_of_most(self, held: Counter[Owner], *, only_unserved: bool) -> Session | None:
         """Return the least recently used session without tasks, of the owners that hold the most.

@@ -19,8 +19,8 @@ service is blamed.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from typing import TypeAlias
+from collections.abc import Collection, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from holdfast.planning.planner import Planner
 from holdfast.problems import checked
 from holdfast.protocol.effects import Effects
 from holdfast.protocol.messages import DIGEST_SIZE, SensingAnswer
-from holdfast.protocol.question import OWN_PLANNER, Provenance, Question, WrongAnswer, same_actions
+from holdfast.protocol.question import OWN_PLANNER, Provenance, Question, same_actions
 from holdfast.protocol.robot_events import (
     ComputeOwnAnswer,
     OwnAnswer,
@@ -42,6 +42,18 @@ MAX_OPEN_CHECKS = 64
 
 _Difference: TypeAlias = tuple[int, str, str]
 """Step of the first action that differs, the service's action, and the own planner's."""
+
+
+class WrongAnswer(NamedTuple):
+    """A service's answer that differs from the own planner's."""
+
+    service: str
+    kind: str  # task or sensing
+    step: int  # of the first action that differs
+    # answered, own: the service's action, and the own planner's; of sensing actions with the
+    # state's digest.
+    answered: str
+    own: str
 
 
 class Verification:
@@ -63,6 +75,10 @@ class Verification:
         self._planner = planner
         self._effects = effects
         self._asked: dict[int, Question] = {}
+        # The own planner's answers, or None, to questions that it was asked or that were left out.
+        self._own: dict[Question, OwnAnswer | None] = {}
+        # Answers that differ from it, until the own planner has decided a second time.
+        self._differing: dict[Question, list[WrongAnswer]] = {}
         self._number = 0
         self._wrong: list[WrongAnswer] = []
         self._limits_are_known = True
@@ -74,6 +90,11 @@ class Verification:
         """Return the wrong answers found since the last call."""
         wrong, self._wrong = self._wrong, []
         return wrong
+
+    def keep(self, questions: Collection[Question]) -> None:
+        """Forget other questions: no service answers them any more, nor does the own planner."""
+        kept = {*questions, *self._asked.values()}
+        self._own = {question: own for question, own in self._own.items() if question in kept}
 
     # -- answers ---------------------------------------------------------------------------------
 
@@ -106,7 +127,7 @@ class Verification:
             self._two_answers(question, "sensing", provenance.service)
 
     def _two_answers(self, question: Question, kind: str, service: str) -> None:
-        if question.check_decided:
+        if question in self._own:
             return
         self._effects.report(
             "disagreement",
@@ -159,9 +180,9 @@ class Verification:
 
     def check(self, question: Question) -> None:
         """Have the own planner answer a question when it has time."""
-        if question.check_decided:
+        if question in self._own:
             return
-        question.check_decided = True
+        self._own[question] = None
         # Before the answer is there: it may never come, and that is to be known.
         asks = len(self._asked) < MAX_OPEN_CHECKS
         _, service = question.followed()[-1]
@@ -171,9 +192,10 @@ class Verification:
 
     def _sample(self, question: Question, kind: str, service: str) -> None:
         """Have a share of the questions answered by the own planner, too."""
-        if question.own is not None:
-            if not self._compare(question, kind, question.own):
-                question.follow_own(question.own, question.own.computed_s)
+        own = self._own.get(question)
+        if own is not None:
+            if not self._compare(question, kind, own):
+                question.follow_own(own, own.computed_s)
         elif service != self._exempt and self._is_drawn(question):
             self.check(question)
 
@@ -197,8 +219,9 @@ class Verification:
         question = self._asked.pop(event.number, None)
         if question is None:
             return True
-        if question.own is not None:
-            self._decided_again(question, question.own, event)
+        first = self._own[question]
+        if first is not None:
+            self._decided_again(question, first, event)
             return True
         if event.failure is not None:
             self._effects.report(
@@ -207,7 +230,7 @@ class Verification:
             for kind, service in question.followed():
                 self._note(question, service, kind, "failed")
             return True
-        question.own = event
+        self._own[question] = event
         agrees = [self._compare(question, kind, event) for kind, _ in question.followed()]
         if all(agrees) or question is not current:
             return True
@@ -228,12 +251,11 @@ class Verification:
                 reason="the robot's own planner came to two decisions in one state, so the "
                 "problem is not deterministic; the first one stands",
             )
-        for wrong in question.differing:
+        for wrong in self._differing.pop(question):
             if is_certain:
                 self._blame(question, wrong)
             else:
                 self._note(question, wrong.service, wrong.kind, "not_deterministic")
-        question.differing.clear()
 
     def _compare(self, question: Question, kind: str, own: OwnAnswer) -> bool:
         """Return whether a followed part is the own planner's; if not, have it decide again."""
@@ -247,9 +269,10 @@ class Verification:
         if difference is None:
             self._note(question, service, kind, "same")
             return True
-        question.differing.append(WrongAnswer(service, kind, *difference))
-        if question not in self._asked.values():
+        if question not in self._differing:
+            self._differing[question] = []
             self._ask(question, again=True)
+        self._differing[question].append(WrongAnswer(service, kind, *difference))
         return False
 
     def _blame(self, question: Question, wrong: WrongAnswer) -> None:

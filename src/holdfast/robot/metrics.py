@@ -79,9 +79,9 @@ class RobotMetrics:
         for each in Status:
             status.add_metric([each.value], int(each is robot.status))
         yield status
-        if robot.trial is not None and robot.step is not None:
-            yield GaugeMetricFamily("holdfast_robot_trial", "The current trial.", robot.trial)
-            yield GaugeMetricFamily("holdfast_robot_step", "The step in that trial.", robot.step)
+        if (state := robot.state) is not None:
+            yield GaugeMetricFamily("holdfast_robot_trial", "The current trial.", state.trial)
+            yield GaugeMetricFamily("holdfast_robot_step", "The step in that trial.", state.step)
         trials = CounterMetricFamily(
             "holdfast_robot_trials", "Trials finished, by outcome.", labels=["outcome"]
         )

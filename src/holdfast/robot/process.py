@@ -256,7 +256,8 @@ class RobotProcess:
             return f"trial {self._replayed} (seed {seed}), as the journal has it"
         if self._starting is not None:
             return f"trial {self._starting[0]} (seed {seed})"
-        return f"trial {self.robot.trial} (seed {seed}), step {self.robot.step}"
+        step = None if (state := self.robot.state) is None else state.step
+        return f"trial {self.robot.trial} (seed {seed}), step {step}"
 
     def _interrupt(self, number: int | None, within_s: float | None = None) -> None:
         """Ask for an end in order, from any thread or a signal's handler."""
@@ -399,9 +400,7 @@ class RobotProcess:
             self._starting = None
             if isinstance(event, EnvironmentFailed):
                 raise HeldError(f"trial {trial} cannot go on at step {event.step}: {event.text}")
-            self._carry_out(
-                robot.begin_trial(trial, history, event, now, tail_is_certain=tail_is_certain)
-            )
+            self._carry_out(robot.begin_trial(history, event, now, tail_is_certain=tail_is_certain))
             if self._watch is not None:
                 self._watch.begun()
         elif not isinstance(event, EnvironmentReady):

@@ -7,7 +7,7 @@ the next job, and it has sent all replies. Long jobs, which compute without the 
 large requests go to threads; their results return to the loop.
 
 A brief job cannot be interrupted, so a job counts as brief only if those before it of the same
-robot were, and if it is as usual (:class:`~holdfast.protocol.service_jobs.StartJob`).
+robot were, and if it is as usual (:class:`~holdfast.protocol.service_jobs.Job`).
 
 What a peer sends may lead to any exception, and none ends the process. Decoding and jobs touch
 nothing that is shared, so an exception there refuses that request alone. One in the machine, also
@@ -44,7 +44,6 @@ from holdfast.protocol.service_jobs import (
     JobResult,
     SendReply,
     ServiceEffect,
-    StartJob,
 )
 from holdfast.protocol.service_limits import ServiceStatistics
 from holdfast.runtime.events import EventRates, EventSink
@@ -93,9 +92,9 @@ class ServiceShell:
         self._on_decision = on_decision
         self._calls: dict[int, IncomingCall] = {}
         self._numbers = itertools.count(1)
-        self._undecoded = 0
+        # Large requests that are being decoded, of each robot; and their bytes.
+        self._undecoded: Counter[str | None] = Counter()
         self._undecoded_bytes = 0
-        self._undecoded_of: Counter[str | None] = Counter()
         self._unread = 0
         self._rates = EventRates()
         self._brief_jobs: deque[Job] = deque()
@@ -199,11 +198,10 @@ class ServiceShell:
         size = len(payload)
         if size <= _LARGE_BYTES:
             self._decoded(call, size, _decode(payload))
-        elif self._undecoded >= _MAX_UNDECODED or self._takes_too_much(call.robot, size):
+        elif self._undecoded.total() >= _MAX_UNDECODED or self._takes_too_much(call.robot, size):
             self._reject_unread(call)
         else:
-            self._undecoded += 1
-            self._undecoded_of[call.robot] += 1
+            self._undecoded[call.robot] += 1
             self._undecoded_bytes += size
             done = functools.partial(self._guarded, self._large_one_decoded, call, size)
             self._decoder.submit(functools.partial(_decode, payload), done)
@@ -211,9 +209,9 @@ class ServiceShell:
     def _takes_too_much(self, robot: str | None, size: int) -> bool:
         """Return whether a large request exceeds the bound on bytes."""
         wanted_bytes = self._undecoded_bytes + size
-        if self._undecoded_of[robot]:
+        if self._undecoded[robot]:
             return wanted_bytes > _MAX_UNDECODED_BYTES
-        return self._undecoded > 0 and wanted_bytes > 2 * _MAX_UNDECODED_BYTES
+        return bool(self._undecoded) and wanted_bytes > 2 * _MAX_UNDECODED_BYTES
 
     def _reject_unread(self, call: IncomingCall) -> None:
         self._unread += 1
@@ -223,10 +221,9 @@ class ServiceShell:
     def _large_one_decoded(
         self, call: IncomingCall, size: int, request: Request | MessageError
     ) -> None:
-        self._undecoded -= 1
-        self._undecoded_of[call.robot] -= 1
-        if not self._undecoded_of[call.robot]:
-            del self._undecoded_of[call.robot]
+        self._undecoded[call.robot] -= 1
+        if not self._undecoded[call.robot]:
+            del self._undecoded[call.robot]
         self._undecoded_bytes -= size
         self._decoded(call, size, request)
 
@@ -332,7 +329,7 @@ class ServiceShell:
                 self._has_replied |= not is_last
             elif isinstance(effect, EndCall):
                 self._calls.pop(effect.call).end()
-            elif isinstance(effect, StartJob):
+            elif isinstance(effect, Job):
                 self._run(effect)
             elif isinstance(effect, LogEvent):
                 self.note(effect.name, **effect.fields)
@@ -344,10 +341,9 @@ class ServiceShell:
             self._idle.set_result(None)
             self._idle = None
 
-    def _run(self, run: StartJob) -> None:
-        job = run.job
-        if run.expected_s == math.inf:
-            pool = self._brief if run.is_brief else self._others
+    def _run(self, job: Job) -> None:
+        if job.expected_s == math.inf:
+            pool = self._brief if job.is_brief else self._others
             pool.submit(
                 functools.partial(self._computed, job),
                 lambda computed: self._guarded(self._finished, job, *computed),

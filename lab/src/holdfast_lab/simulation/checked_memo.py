@@ -66,7 +66,7 @@ class JobCache:
 
     def outcome(self, job: Job) -> JobResult:
         """Return the outcome of a job; another one than the last time is a Violation."""
-        if job.is_cancelled:
+        if job.interruption.is_set:
             return job.run()  # its outcome follows from that, and not from what it was made with
         state = job.state
         known = None

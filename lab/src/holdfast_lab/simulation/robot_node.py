@@ -455,9 +455,7 @@ class RobotNode:
         begun = EnvironmentReady(ending, performed, last, resumed.late)
         self._world.note("robot", "begins trial %s at step %s", trial, known)
         self._note_late(resumed.late)
-        self._carry_out(
-            robot.begin_trial(trial, history, begun, self._now(), tail_is_certain=is_complete)
-        )
+        self._carry_out(robot.begin_trial(history, begun, self._now(), tail_is_certain=is_complete))
 
     def _note_late(self, late: tuple[Late, ...]) -> None:
         for each in late:

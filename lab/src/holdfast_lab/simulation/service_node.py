@@ -15,7 +15,6 @@ from holdfast.protocol.service_jobs import (
     JobResult,
     SendReply,
     ServiceEffect,
-    StartJob,
 )
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast_lab.simulation.event_queue import Clock
@@ -135,25 +134,25 @@ class ServiceNode:
                 network.reply(self, effect.call, effect.payload)
             elif isinstance(effect, EndCall):
                 network.end(self, effect.call)
-            elif isinstance(effect, StartJob):
+            elif isinstance(effect, Job):
                 self._begin(effect)
         due = machine.next_wakeup()
         if due is not None and (self._wakes_at is None or due < self._wakes_at):
             self._wakes_at = due
             queue.after(self._clock.until(due), self._tick, self._memory, due)
 
-    def _begin(self, run: StartJob) -> None:
+    def _begin(self, job: Job) -> None:
         """Compute for as long as the run says, and not as this machine does.
 
         A short job begins when those before it have ended.
         """
-        job, queue = run.job, self._world.queue
+        queue = self._world.queue
         most_s, job.interruption.most_s = job.interruption.most_s, math.inf
         cost_s = max(self.slownesses, default=1.0) * self._cost_s[job.kind]
         if cost_s > most_s:
             job.interruption.use_up()
         took_s, waits_s = min(cost_s, most_s), 0.0
-        if run.expected_s < math.inf:
+        if job.expected_s < math.inf:
             waits_s = max(0.0, self._short_ones_end_at - queue.now)
             self._short_ones_end_at = queue.now + waits_s + took_s
         queue.after(waits_s + took_s, self._finish, self._memory, job, took_s)
