@@ -413,7 +413,8 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
             }
         }
         if (shared) {
-            prior_entropies(sets, weights.data(), number, settings, constants, values.data());
+            prior_entropies(sets, weights.data(), survivors, number, settings, constants,
+                            values.data());
             counts.visits += sets.number * count * count;
             for (std::size_t i = 0; i < values.size(); ++i) {
                 values[i] = survivors[i % number] == 0 ? std::numeric_limits<double>::quiet_NaN()

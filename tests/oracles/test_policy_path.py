@@ -153,6 +153,9 @@ def test_the_kernel_follows_as_numpy_does(name: str) -> None:
         assert has_own(problem, "expected_path", ("policy", "limit_action", "next_stage"))
         expected_states, expected_stages = _followed(plain, states, stage, offsets, 1)
         np.testing.assert_array_equal(states_at, expected_states)
+        if name != "busy_room":
+            commanded = problem.path_actions(states, stage, offsets, 1)
+            np.testing.assert_array_equal(commanded, problem.policy(states_at, stages_at))
         np.testing.assert_array_equal(stages_at, np.broadcast_to(expected_stages, (6, 150)))
     assert problem.num_stages == 1 or (stages_at[-1] == problem.num_stages - 1).any()
 

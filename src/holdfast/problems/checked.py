@@ -305,6 +305,15 @@ def expected_path(
     return states_at, stages_at
 
 
+def path_actions(
+    problem: Any, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
+) -> FloatArray:
+    """Return the actions commanded along each path: a built-in problem's, in the kernel."""
+    shape = (len(offsets), states.shape[0], problem.action_size)
+    found = _ask(problem, "path_actions", states, stage, offsets, threads)
+    return _array(problem, "path_actions", found, shape)
+
+
 def rewards(problem: Any, states: FloatArray, actions: FloatArray) -> FloatArray:
     """Return the rewards of executed actions that led to many states."""
     found = _ask(problem, "reward", states, actions)

@@ -167,9 +167,15 @@ class RigidBodyProblem(KeepsReadOnly, ProblemBase):
         A problem makes this its ``expected_path`` beside its own ``policy``: an inherited one
         would not count, for it does not follow a policy that a subclass replaces.
         """
-        return self.world.follow(
-            self._path_policy.own, states, stage, offsets, self._collision_tolerance, threads
-        )
+        way = states, stage, offsets, self._collision_tolerance, threads
+        return self.world.follow(self._path_policy.own, *way)
+
+    def command_on_path(
+        self, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
+    ) -> FloatArray:
+        """Return what the policy commands at each offset of that way, as ``path_actions``."""
+        way = states, stage, offsets, self._collision_tolerance, threads
+        return self.world.follow(self._path_policy.own, *way, commands=True)[0]
 
     def roll_out_policy(
         self,
