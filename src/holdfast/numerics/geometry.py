@@ -216,20 +216,10 @@ class _World(KeepsReadOnly):
         cpp/src/rollouts.hpp has the noise.
         """
         returns = np.empty(estimates.shape[:2])
-        rolled_out = self._kernel.own.roll_out(
-            policy,
-            self._rows("true states", true_states),
-            self._rows("estimates", estimates),
-            self._rows("clouds", clouds),
-            stage,
-            standard_deviation,
-            tolerance,
-            stream.for_motion(),
-            rollouts,
-            threads,
-            returns,
-        )
-        if not rolled_out:
+        given = ("true states", true_states), ("estimates", estimates), ("clouds", clouds)
+        begun = *(self._rows(*each) for each in given), stage
+        noise = standard_deviation, tolerance, stream.for_motion()
+        if not self._kernel.own.roll_out(policy, *begun, *noise, rollouts, threads, returns):
             _raise_not_finite("clouds", clouds)
         return returns
 

@@ -125,9 +125,7 @@ def nats_of_halving(settings: PlanningSettings) -> float:
 
 def _factors(offsets: tuple[int, ...], discount: float) -> tuple[float, ...]:
     """Return ``discount**offset`` by multiplication, which has the same bits everywhere."""
-    factors = []
-    factor = 1.0
-    before = 0
+    factors, factor, before = [], 1.0, 0
     for offset in offsets:
         for _ in range(offset - before if discount < 1.0 else 0):
             factor *= discount

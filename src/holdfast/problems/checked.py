@@ -305,13 +305,11 @@ def expected_path(
     return states_at, stages_at
 
 
-def path_actions(
-    problem: Any, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
-) -> FloatArray:
+def path_actions(problem: Any, states: FloatArray, *way: Any) -> FloatArray:
     """Return the actions commanded along each path: a built-in problem's, in the kernel."""
-    shape = (len(offsets), states.shape[0], problem.action_size)
-    found = _ask(problem, "path_actions", states, stage, offsets, threads)
-    return _array(problem, "path_actions", found, shape)
+    _, offsets, _ = way
+    found = _ask(problem, "path_actions", states, *way)
+    return _array(problem, "path_actions", found, (len(offsets), len(states), problem.action_size))
 
 
 def rewards(problem: Any, states: FloatArray, actions: FloatArray) -> FloatArray:

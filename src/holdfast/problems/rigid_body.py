@@ -192,18 +192,10 @@ class RigidBodyProblem(KeepsReadOnly, ProblemBase):
         A problem makes this its ``rollout_returns``, as :meth:`follow_policy` its
         ``expected_path``.
         """
-        return self.world.roll_out(
-            self._path_policy.own,
-            true_states,
-            estimates,
-            clouds,
-            stage,
-            self._motion_deviation,
-            max(self._collision_tolerance, _ROLLOUT_TOLERANCE),
-            motion,
-            rollouts,
-            threads,
-        )
+        begun = true_states, estimates, clouds, stage
+        tolerance = max(self._collision_tolerance, _ROLLOUT_TOLERANCE)
+        noise = self._motion_deviation, tolerance, motion
+        return self.world.roll_out(self._path_policy.own, *begun, *noise, rollouts, threads)
 
     def _check_sensing_action(self, sensing_action: int) -> None:
         count = len(self.sensing_actions)
