@@ -155,7 +155,7 @@ for problem in (PegInHole2D(), MultitierPegInHole2D(), PegInHole3D(), CapsuleRob
     states = problem.initial_states(stream.substream(10), 99)
     for stage in range(problem.num_stages):
         note(f"way {problem.name} {stage}", *problem.expected_path(states, stage, (0, 9, 99), 2),
-             problem.path_actions(states, stage, (0, 9, 99), 2))
+             problem._path_actions(states, stage, (0, 9, 99), 2))
         for counts_steps in (False, True):
             note(f"rollouts {problem.name} {stage} {counts_steps}", problem.rollout_returns(
                 states[:21], np.stack([states[i:21 + i] for i in (0, 9, 9)]),

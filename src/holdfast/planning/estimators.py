@@ -363,6 +363,7 @@ def entropy(
         raise InvalidValueError(
             f"point {bad} is {array[bad]}: every coordinate must be finite and at most {LARGEST:g}"
         )
+    _check_dimension(array.shape[1])
     if not isinstance(estimator, GaussianMixture):
         neighbors = whole("neighbors", estimator.neighbors, 1)
         if neighbors >= count > 1:

@@ -57,7 +57,7 @@ def path_points(
         raise InvalidValueError(f"{section}.{key} {reason}")
     offsets, threads = path_steps(settings), settings.active_sensing.num_cores
     way = problem, states, stage, offsets, threads
-    if has_own(problem, "path_actions", ("expected_path", *_STEP)):
+    if has_own(problem, "_path_actions", ("expected_path", *_STEP)):
         points = checked.path_actions(*way)
     else:
         points = checked.policy(problem, *_followed(*way))

@@ -173,7 +173,7 @@ class RigidBodyProblem(KeepsReadOnly, ProblemBase):
     def command_on_path(
         self, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
     ) -> FloatArray:
-        """Return what the policy commands at each offset of that way, as ``path_actions``."""
+        """Return what the policy commands at each offset of that way, as ``_path_actions``."""
         way = states, stage, offsets, self._collision_tolerance, threads
         return self.world.follow(self._path_policy.own, *way, commands=True)[0]
 
