@@ -157,11 +157,12 @@ std::size_t draw_free_batch(const World& world, const Input<1>& mean,
 template <class World, class Policy>
 bool follow_batch(const World& world, const OwnedPolicy<Policy>& policy, const Input<2>& states,
                   std::size_t stage, const std::vector<std::uint32_t>& offsets, double tolerance,
-                  int threads, InPlace<double, 3> states_at, InPlace<std::int64_t, 2> stages_at) {
+                  int threads, bool commands, InPlace<double, 3> rows_at,
+                  InPlace<std::int64_t, 2> stages_at) {
     constexpr std::size_t d = World::dimension;
     const std::size_t count = states.shape(0);
-    require(states.shape(1) == d && states_at.shape(2) == d && states_at.shape(1) == count &&
-                states_at.shape(0) == offsets.size() && stages_at.shape(1) == count &&
+    require(states.shape(1) == d && rows_at.shape(2) == d && rows_at.shape(1) == count &&
+                rows_at.shape(0) == offsets.size() && stages_at.shape(1) == count &&
                 stages_at.shape(0) == offsets.size(),
             "shapes differ");
     require(!offsets.empty() && std::is_sorted(offsets.begin(), offsets.end()),
@@ -170,7 +171,7 @@ bool follow_batch(const World& world, const OwnedPolicy<Policy>& policy, const I
     if (!all_finite(states.data(), count * d)) return false;
     WithoutInterpreter released;
     follow<World, Policy>(world, policy, count, states.data(), stage, offsets, tolerance, threads,
-                          states_at.data(), stages_at.data());
+                          commands, rows_at.data(), stages_at.data());
     return true;
 }
 
@@ -240,8 +241,9 @@ template <class World, class Policy>
 void bind_way(nb::class_<World>& world) {
     world.def("follow", &follow_batch<World, Policy>, nb::arg("policy"),
               nb::arg("states").noconvert(), nb::arg("stage"), nb::arg("offsets"),
-              nb::arg("tolerance"), nb::arg("threads"), nb::arg("states_at").noconvert(),
-              nb::arg("stages_at").noconvert(), nb::call_guard<StandardRounding>());
+              nb::arg("tolerance"), nb::arg("threads"), nb::arg("commands"),
+              nb::arg("rows_at").noconvert(), nb::arg("stages_at").noconvert(),
+              nb::call_guard<StandardRounding>());
     world.def("roll_out", &roll_out_batch<World, Policy>, nb::arg("policy"),
               nb::arg("true_states").noconvert(), nb::arg("estimates").noconvert(),
               nb::arg("clouds").noconvert(), nb::arg("stage"),

@@ -413,7 +413,8 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
             }
         }
         if (shared) {
-            prior_entropies(sets, weights.data(), number, settings, constants, values.data());
+            prior_entropies(sets, weights.data(), survivors, number, settings, constants,
+                            values.data());
             counts.visits += sets.number * count * count;
             for (std::size_t i = 0; i < values.size(); ++i) {
                 values[i] = survivors[i % number] == 0 ? std::numeric_limits<double>::quiet_NaN()
@@ -486,9 +487,11 @@ void entropies(const PointSets& sets, std::size_t posteriors, const PosteriorSou
                                     static_cast<double>(count);
                 if (begin > 0 || from > 0) {
                     shared_groups.resize(here);
-                    parallel_for(
-                        here, threads_for(work, here, settings.threads),
-                        [&](std::size_t h) { shared_groups[h] = make_group(begin, from + h); });
+                    parallel_for(here, threads_for(work, here, settings.threads),
+                                 [&](std::size_t h) {
+                                     shared_groups[h].reset();  // or both would take memory
+                                     shared_groups[h] = make_group(begin, from + h);
+                                 });
                 }
                 const std::size_t pieces = shared_groups[0]->pieces();
                 parallel_for(here * pieces, threads_for(work, here * pieces, settings.threads),

@@ -146,7 +146,7 @@ std::size_t draw_free(const World& world, std::size_t count, const double* mean,
 template <class World, class Policy>
 void follow(const World& world, const Policy& policy, std::size_t count, const double* states,
             std::size_t stage, const std::vector<std::uint32_t>& offsets, double tolerance,
-            int threads, double* states_at, std::int64_t* stages_at) {
+            int threads, bool commands, double* rows_at, std::int64_t* stages_at) {
     constexpr std::size_t d = World::dimension;
     static_assert(Policy::dimension == d);
     const auto& steps = kernels_of(vector_kernels(), policy);
@@ -224,10 +224,13 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
                 if (const auto hits = steps.act(policy, shape, way, moving); hits != 0) stop(hits);
                 moving = steps.arrive(policy, way, moving);
             }
+            if (commands) steps.command(policy, way);
+            const auto& columns = commands ? action : state;
             for (std::size_t i = 0; i < own; ++i) {
                 const std::size_t at = k * count + first + i;
-                for (std::size_t c = 0; c < d; ++c)
-                    states_at[at * d + c] = state[c * way_stride + i];
+                for (std::size_t c = 0; c < d; ++c) {
+                    rows_at[at * d + c] = columns[c * way_stride + i];
+                }
                 stages_at[at] = own_stage[i];
             }
         }
@@ -246,7 +249,7 @@ void follow(const World& world, const Policy& policy, std::size_t count, const d
 #define HOLDFAST_INSTANTIATE_WAY(World, Policy)                                                  \
     template void follow<World, Policy>(const World&, const Policy&, std::size_t, const double*, \
                                         std::size_t, const std::vector<std::uint32_t>&, double,  \
-                                        int, double*, std::int64_t*);
+                                        int, bool, double*, std::int64_t*);
 
 HOLDFAST_INSTANTIATE(DiscWorld)
 HOLDFAST_INSTANTIATE(RectangleWorld)

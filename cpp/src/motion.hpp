@@ -76,11 +76,12 @@ std::size_t draw_free(const World& world, std::size_t count, const double* mean,
 // Follows a policy of policies.hpp without noise: in each step its action, stopped at contact, and
 // the stage that follows. A tolerance of 0: obstacles do not stop it.
 //
-// `offsets` are numbers of steps, in ascending order. For each of them `states_at[number][count]`
-// and `stages_at[number][count]` are where the particle is after so many.
+// `offsets` are numbers of steps, in ascending order. For each of them `stages_at[number][count]`
+// is the stage after so many, and `rows_at[number][count]` where the particle is then, or with
+// `commands` what the policy commands there, without the limits of a step.
 template <class World, class Policy>
 void follow(const World& world, const Policy& policy, std::size_t count, const double* states,
             std::size_t stage, const std::vector<std::uint32_t>& offsets, double tolerance,
-            int threads, double* states_at, std::int64_t* stages_at);
+            int threads, bool commands, double* rows_at, std::int64_t* stages_at);
 
 }  // namespace holdfast

@@ -6,6 +6,7 @@
 #include <memory>
 #include <numeric>
 #include <optional>
+#include <span>
 #include <utility>
 #include <vector>
 
@@ -117,17 +118,18 @@ void Coordinates::bring_together_equals(std::size_t size, std::size_t stride) {
     for (std::uint32_t n = 0; n < size; ++n) order[begins[class_of[n]]++] = n;
 }
 
-/// Writes the rows of a vector: of eight posteriors, of which the first of all is the prior.
+/// Writes the rows of a vector: of eight posteriors, in some order, of which the first of all is
+/// the prior.
 void write_rows(const std::vector<std::uint32_t>& present, const double* prior,
-                const double* weights, std::size_t count, std::size_t number, std::size_t vector,
-                double* to) {
+                const double* weights, std::size_t count, std::span<const std::size_t> order,
+                std::size_t vector, double* to) {
     const std::vector<double> nothing(count);
     const double* columns[lane_count];
     for (std::size_t lane = 0; lane < lane_count; ++lane) {
         const std::size_t column = vector * lane_count + lane;
-        columns[lane] = column == 0        ? prior
-                        : column <= number ? weights + (column - 1) * count
-                                           : nothing.data();
+        columns[lane] = column == 0              ? prior
+                        : column <= order.size() ? weights + order[column - 1] * count
+                                                 : nothing.data();
     }
     // Row by row: column by column they would go through the first cache eight times.
     for (std::size_t i = 0; i < present.size(); ++i) {
@@ -139,7 +141,8 @@ void write_rows(const std::vector<std::uint32_t>& present, const double* prior,
 
 }  // namespace
 
-void prior_entropies(const PointSets& sets, const double* weights, std::size_t number,
+void prior_entropies(const PointSets& sets, const double* weights,
+                     const std::vector<std::size_t>& survivors, std::size_t number,
                      const EntropySettings& settings, const NearestNeighborConstants& constants,
                      double* out) {
     std::vector<std::uint32_t> present;
@@ -150,13 +153,19 @@ void prior_entropies(const PointSets& sets, const double* weights, std::size_t n
     const std::size_t stride = (size + lane_count - 1) / lane_count * lane_count;
     const std::size_t blocks = (size + prior_block_size - 1) / prior_block_size;
     const auto k = static_cast<std::uint32_t>(std::min<std::size_t>(settings.neighbors, size - 1));
+    // Posteriors of many points beside each other, and beside the prior: then those of few leave
+    // out most points together.
+    std::vector<std::size_t> order(number);
+    std::iota(order.begin(), order.end(), std::size_t{0});
+    std::stable_sort(order.begin(), order.end(),
+                     [&](std::size_t a, std::size_t b) { return survivors[a] > survivors[b]; });
     // As many posteriors at a time as one set allows, then as many sets.
     const std::size_t most = std::max<std::size_t>(lane_count, most_gains / size) - 1;
     for (std::size_t first = 0; first < number; first += most) {
         const std::size_t here = std::min(most, number - first);
         const std::size_t vectors = (1 + here + lane_count - 1) / lane_count;
         const std::size_t columns = vectors * lane_count;
-        const double* own = weights + first * sets.count;
+        const std::span<const std::size_t> own(order.data() + first, here);
         const std::size_t together =
             std::clamp<std::size_t>(most_gains / (size * columns), 1, sets.number);
         Lined rows(size * columns), gains(together * size * columns), terms(together * size);
@@ -176,7 +185,7 @@ void prior_entropies(const PointSets& sets, const double* weights, std::size_t n
                                  return;
                              }
                              const std::size_t v = i - of_sets;
-                             write_rows(present, settings.prior, own, sets.count, here, v,
+                             write_rows(present, settings.prior, weights, sets.count, own, v,
                                         rows.data() + v * size * lane_count);
                          });
             const std::size_t pieces = of_sets * blocks;
@@ -210,7 +219,7 @@ void prior_entropies(const PointSets& sets, const double* weights, std::size_t n
                     }
                 }
                 for (std::size_t p = 0; p < here; ++p) {
-                    out[(from + h) * number + first + p] = entropy - gained[1 + p];
+                    out[(from + h) * number + own[p]] = entropy - gained[1 + p];
                 }
             }
         }
@@ -218,10 +227,10 @@ void prior_entropies(const PointSets& sets, const double* weights, std::size_t n
         for (std::size_t p = 0; p < here && size < sets.count; ++p) {
             bool outside = false;
             for (std::size_t n = 0; n < sets.count; ++n) {
-                outside |= own[p * sets.count + n] > 0.0 && !(settings.prior[n] > 0.0);
+                outside |= weights[own[p] * sets.count + n] > 0.0 && !(settings.prior[n] > 0.0);
             }
             for (std::size_t set = 0; set < sets.number && outside; ++set) {
-                out[set * number + first + p] = infinity;
+                out[set * number + own[p]] = infinity;
             }
         }
     }

@@ -15,15 +15,17 @@
 #pragma once
 
 #include <cstddef>
+#include <vector>
 
 #include "entropy.hpp"
 #include "vector_kernels.hpp"
 
 namespace holdfast {
 
-/// Entropies out[set][posterior] of `number` posteriors, weights[number][count]. The prior,
-/// settings.prior: not negative, one of them positive, sum 1.
-void prior_entropies(const PointSets& sets, const double* weights, std::size_t number,
+/// Entropies out[set][posterior] of `number` posteriors, weights[number][count], of which each has
+/// so many `survivors`. The prior, settings.prior: not negative, one of them positive, sum 1.
+void prior_entropies(const PointSets& sets, const double* weights,
+                     const std::vector<std::size_t>& survivors, std::size_t number,
                      const EntropySettings& settings, const NearestNeighborConstants& constants,
                      double* out);
 

@@ -170,6 +170,8 @@ struct PolicyKernels {
     /// Makes the next state of those in the bits `moving` their state, with its stage. Returns
     /// which of them have changed.
     std::uint32_t (*arrive)(const Policy&, const Way&, std::uint32_t moving);
+    /// The actions that the policy commands in all states, without the limits of a step.
+    void (*command)(const Policy&, const Way&);
 };
 
 struct VectorKernels {

@@ -163,7 +163,8 @@ class _World:
         offsets: Sequence[int],
         tolerance: float,
         threads: int,
-        states_at: _Floats,
+        commands: bool,
+        rows_at: _Floats,
         stages_at: npt.NDArray[np.int64],
     ) -> bool: ...
     def roll_out(

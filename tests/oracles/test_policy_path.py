@@ -141,9 +141,8 @@ def test_threads_change_nothing(count: int, estimator: str) -> None:
 @pytest.mark.parametrize("name", [*registry.names(), "busy_room"])
 def test_the_kernel_follows_as_numpy_does(name: str) -> None:
     """Bit for bit, through contacts and stages, for one way of several hundred steps."""
-    if name == "busy_room":
-        problem: Any = BusyRoom()
-    else:
+    problem: Any = BusyRoom()
+    if name != "busy_room":
         problem = registry.problem_class(name).from_settings({}, {})
     plain: Any = _Plain(problem)
     offsets = (0, 1, 9, 36, 300, 301)
@@ -153,6 +152,8 @@ def test_the_kernel_follows_as_numpy_does(name: str) -> None:
         assert has_own(problem, "expected_path", ("policy", "limit_action", "next_stage"))
         expected_states, expected_stages = _followed(plain, states, stage, offsets, 1)
         np.testing.assert_array_equal(states_at, expected_states)
+        commanded = path_points(problem, path(offsets), states, stage).points
+        np.testing.assert_array_equal(commanded, problem.policy(states_at, stages_at))
         np.testing.assert_array_equal(stages_at, np.broadcast_to(expected_stages, (6, 150)))
     assert problem.num_stages == 1 or (stages_at[-1] == problem.num_stages - 1).any()
 

@@ -167,7 +167,8 @@ for world, size in ((DiscWorld(0.4, flat), 2), (RectangleWorld(0.6, 1.4, flat), 
 for problem in (PegInHole2D(), MultitierPegInHole2D(), PegInHole3D(), CapsuleRobot()):
     states = problem.initial_states(stream.substream(10), 99)
     for stage in range(problem.num_stages):
-        note(f"way {problem.name} {stage}", *problem.expected_path(states, stage, (0, 9, 99), 2))
+        note(f"way {problem.name} {stage}", *problem.expected_path(states, stage, (0, 9, 99), 2),
+             problem._path_actions(states, stage, (0, 9, 99), 2))
         for counts_steps in (False, True):
             note(f"rollouts {problem.name} {stage} {counts_steps}", problem.rollout_returns(
                 states[:21], np.stack([states[i:21 + i] for i in (0, 9, 9)]),

@@ -1,7 +1,7 @@
 // Collision tests of many states side by side (one compilation per instruction set).
 //
-// Operation by operation those of `collides` in geometry_2d.cpp and geometry_3d.cpp, so the answers
-// are the same.
+// Operation by operation those of `collides` in geometry_2d.cpp and geometry_3d.cpp, but for what
+// adds zero, so the answers are the same.
 
 #pragma once
 
@@ -53,9 +53,9 @@ HOLDFAST_INLINE IntLanes discs_hit(const DiscShape& shape, const Lanes& x, const
     return hits;
 }
 
-/// Which of eight rectangles are in collision, as bits.
+/// Which of eight rectangles are in collision, as bits, of those that are asked for.
 HOLDFAST_INLINE unsigned rectangles_hit(const RectangleShape& shape, const Lanes& x, const Lanes& y,
-                                        const Lanes& angle) {
+                                        const Lanes& angle, unsigned asked) {
     const double radius = shape.bounding_radius;
     const auto turn = sine_cosine_of(angle);
     const Lanes& sine = turn.sine;
@@ -63,7 +63,7 @@ HOLDFAST_INLINE unsigned rectangles_hit(const RectangleShape& shape, const Lanes
     const Lanes s = size_of(sine), c = size_of(cosine);
     const Lanes reach_x = c * shape.half_width + s * shape.half_height;
     const Lanes reach_y = s * shape.half_width + c * shape.half_height;
-    unsigned hits = 0;
+    unsigned hits = ~asked & 0xffu;
     for (std::size_t o = 0; o < shape.num_obstacles && hits != 0xffu; ++o) {
         const double* limits = shape.obstacles + 4 * o;
         const Lanes left = limits[0] - x, bottom = limits[1] - y;
@@ -81,7 +81,7 @@ HOLDFAST_INLINE unsigned rectangles_hit(const RectangleShape& shape, const Lanes
         apart |= (low + lower >= shape.half_height) | (high + higher <= -shape.half_height);
         hits |= ~bits_of(apart) & 0xffu;
     }
-    return hits;
+    return hits & asked;
 }
 
 /// Whether an obstacle's limits, seen from the centres of eight boxes that reach `reach` along a
@@ -98,32 +98,51 @@ HOLDFAST_INLINE IntLanes separated(const Lanes (&direction)[3], const Lanes& rea
     return (least >= reach) | (greatest <= -reach);
 }
 
-HOLDFAST_INLINE Lanes dot(const Lanes (&a)[3], const Lanes (&b)[3]) {
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-}
+/// The normals to an edge of each of eight boxes and to one of an obstacle, which are the same for
+/// all obstacles. A normal to the obstacle's edges along axis c has no coordinate c.
+struct EdgeNormals {
+    Lanes reach[3][3];
+    IntLanes usable[3][3];
 
-/// Whether a normal to an edge of each of eight boxes and to one of an obstacle separates them.
-HOLDFAST_INLINE IntLanes edges_separated(const BoxShape& shape, const Lanes (&axes)[3][3],
-                                         const Lanes (&low)[3], const Lanes (&high)[3]) {
-    const Lanes none = splat(0.0);
+    HOLDFAST_INLINE void find(const BoxShape& shape, const Lanes (&axes)[3][3]) {
+        for (std::size_t k = 0; k < 3; ++k) {
+            const Lanes(&edge)[3] = axes[k];
+            const std::size_t next = (k + 1) % 3, last = (k + 2) % 3;
+            for (std::size_t c = 0; c < 3; ++c) {
+                const std::size_t i = (c + 1) % 3, j = (c + 2) % 3;
+                const auto along = [&](const Lanes(&axis)[3]) HOLDFAST_LAMBDA {
+                    return size_of(edge[i] * axis[j] - edge[j] * axis[i]);
+                };
+                reach[k][c] = shape.half_size[next] * along(axes[next]) +
+                              shape.half_size[last] * along(axes[last]);
+                usable[k][c] = edge[i] * edge[i] + edge[j] * edge[j] >= shortest_axis_squared;
+            }
+        }
+    }
+};
+
+/// Whether such a normal separates each of eight boxes, but for those in the bits `settled`, which
+/// are of no interest.
+HOLDFAST_INLINE IntLanes edges_separated(const EdgeNormals& normals, const Lanes (&axes)[3][3],
+                                         const Lanes (&low)[3], const Lanes (&high)[3],
+                                         unsigned settled) {
     IntLanes apart = splat_int(0);
-    for (std::size_t k = 0; k < 3; ++k) {
-        const Lanes(&edge)[3] = axes[k];
-        const std::size_t next = (k + 1) % 3, last = (k + 2) % 3;
-        const Lanes directions[3][3] = {
-            {none, -edge[2], edge[1]}, {edge[2], none, -edge[0]}, {-edge[1], edge[0], none}};
-        for (const Lanes(&direction)[3] : directions) {
-            const Lanes reach = shape.half_size[next] * size_of(dot(direction, axes[next])) +
-                                shape.half_size[last] * size_of(dot(direction, axes[last]));
-            apart |= (dot(direction, direction) >= shortest_axis_squared) &
-                     separated(direction, reach, low, high);
+    for (std::size_t k = 0; k < 3 && (settled | bits_of(apart)) != 0xffu; ++k) {
+        for (std::size_t c = 0; c < 3; ++c) {
+            const std::size_t i = (c + 1) % 3, j = (c + 2) % 3;
+            Lanes least, greatest, other_least, other_greatest;
+            least_and_greatest(-axes[k][j] * low[i], -axes[k][j] * high[i], least, greatest);
+            least_and_greatest(axes[k][i] * low[j], axes[k][i] * high[j], other_least,
+                               other_greatest);
+            apart |= normals.usable[k][c] & ((least + other_least >= normals.reach[k][c]) |
+                                             (greatest + other_greatest <= -normals.reach[k][c]));
         }
     }
     return apart;
 }
 
-/// Which of eight boxes are in collision, as bits.
-static unsigned boxes_hit(const BoxShape& shape, const Lanes (&state)[6]) {
+/// Which of eight boxes are in collision, as bits, of those that are asked for.
+static unsigned boxes_hit(const BoxShape& shape, const Lanes (&state)[6], unsigned asked) {
     const auto yaw = sine_cosine_of(state[3]);
     const auto pitch = sine_cosine_of(state[4]);
     const auto roll = sine_cosine_of(state[5]);
@@ -140,7 +159,9 @@ static unsigned boxes_hit(const BoxShape& shape, const Lanes (&state)[6]) {
                    shape.half_size[1] * size_of(axes[1][i]) +
                    shape.half_size[2] * size_of(axes[2][i]);
     }
-    unsigned hits = 0;
+    EdgeNormals normals;
+    bool known = false;
+    unsigned hits = ~asked & 0xffu;
     for (std::size_t o = 0; o < shape.num_obstacles && hits != 0xffu; ++o) {
         const double* limits = shape.obstacles + 6 * o;
         Lanes low[3], high[3];
@@ -155,22 +176,26 @@ static unsigned boxes_hit(const BoxShape& shape, const Lanes (&state)[6]) {
         for (std::size_t k = 0; k < 3; ++k) {
             apart |= separated(axes[k], splat(shape.half_size[k]), low, high);
         }
-        if ((hits | bits_of(apart)) == 0xffu) continue;
-        apart |= edges_separated(shape, axes, low, high);
+        const unsigned settled = hits | bits_of(apart);
+        if (settled == 0xffu) continue;
+        if (!known) normals.find(shape, axes);
+        known = true;
+        apart |= edges_separated(normals, axes, low, high, settled);
         hits |= ~bits_of(apart) & 0xffu;
     }
-    return hits;
+    return hits & asked;
 }
 
-/// Which of eight states are in collision, as bits.
-HOLDFAST_INLINE unsigned bits_hit(const DiscShape& shape, const Lanes (&state)[2]) {
-    return bits_of(discs_hit(shape, state[0], state[1]));
+/// Which of eight states are in collision, as bits, of those that are asked for.
+HOLDFAST_INLINE unsigned bits_hit(const DiscShape& shape, const Lanes (&state)[2], unsigned asked) {
+    return bits_of(discs_hit(shape, state[0], state[1])) & asked;
 }
-HOLDFAST_INLINE unsigned bits_hit(const RectangleShape& shape, const Lanes (&state)[3]) {
-    return rectangles_hit(shape, state[0], state[1], state[2]);
+HOLDFAST_INLINE unsigned bits_hit(const RectangleShape& shape, const Lanes (&state)[3],
+                                  unsigned asked) {
+    return rectangles_hit(shape, state[0], state[1], state[2], asked);
 }
-HOLDFAST_INLINE unsigned bits_hit(const BoxShape& shape, const Lanes (&state)[6]) {
-    return boxes_hit(shape, state);
+HOLDFAST_INLINE unsigned bits_hit(const BoxShape& shape, const Lanes (&state)[6], unsigned asked) {
+    return boxes_hit(shape, state, asked);
 }
 
 /// Which of the states, [count][d], are in collision: out[count].
@@ -180,7 +205,9 @@ static void states_collide(const Shape& shape, const double* states, std::size_t
     for (std::size_t begin = 0; begin < count; begin += lane_count) {
         Lanes state[d];
         for (std::size_t c = 0; c < d; ++c) state[c] = coordinate(states, count, begin, d, c);
-        put(out + begin, count - begin, bits_hit(shape, state));
+        const std::size_t left = count - begin;
+        const unsigned asked = left < lane_count ? (1u << left) - 1u : 0xffu;
+        put(out + begin, left, bits_hit(shape, state, asked));
     }
 }
 

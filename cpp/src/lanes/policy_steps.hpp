@@ -41,16 +41,23 @@ struct StageLanes {
     }
 };
 
-HOLDFAST_INLINE void executed(const PegPolicy2D& policy, const StageLanes<PegPolicy2D>& stage,
-                              const Lanes (&state)[3], Lanes (&action)[3]) {
+HOLDFAST_INLINE void commanded(const PegPolicy2D& policy, const StageLanes<PegPolicy2D>& stage,
+                               const Lanes (&state)[3], Lanes (&action)[3]) {
     const Lanes to_axis = stage.number[0] - state[0];
     const IntLanes near = size_of(to_axis) < policy.half_width;
     const IntLanes upright = near & (size_of(state[2]) < stage.number[1]);
     const Lanes none = splat(0.0);
-    action[0] = limited(to_axis, policy.limits[0]);
-    action[1] = limited(select(upright, stage.number[2] - state[1] - policy.height, none),
-                        policy.limits[1]);
-    action[2] = limited(select(near, -state[2], none), policy.limits[2]);
+    action[0] = to_axis;
+    action[1] = select(upright, stage.number[2] - state[1] - policy.height, none);
+    action[2] = select(near, -state[2], none);
+}
+
+/// The limits of a peg: each component on its own.
+template <class Policy>
+HOLDFAST_INLINE void limit(const Policy& policy, Lanes (&action)[Policy::dimension]) {
+    for (std::size_t c = 0; c < Policy::dimension; ++c) {
+        action[c] = limited(action[c], policy.limits[c]);
+    }
 }
 
 HOLDFAST_INLINE IntLanes passed(const PegPolicy2D& policy, const StageLanes<PegPolicy2D>& stage,
@@ -69,19 +76,17 @@ HOLDFAST_INLINE Lanes reward(const PegPolicy2D&, const RectangleShape&, const La
     return minus_norm(action);
 }
 
-HOLDFAST_INLINE void executed(const PegPolicy3D& policy, const StageLanes<PegPolicy3D>&,
-                              const Lanes (&state)[6], Lanes (&action)[6]) {
+HOLDFAST_INLINE void commanded(const PegPolicy3D& policy, const StageLanes<PegPolicy3D>&,
+                               const Lanes (&state)[6], Lanes (&action)[6]) {
     const IntLanes near =
         square_root(state[0] * state[0] + state[1] * state[1]) < policy.half_width;
     const IntLanes upright = near & (square_root(state[3] * state[3] + state[4] * state[4] +
                                                  state[5] * state[5]) < policy.upright_limit);
     const Lanes none = splat(0.0);
-    action[0] = limited(-state[0], policy.limits[0]);
-    action[1] = limited(-state[1], policy.limits[1]);
-    action[2] = limited(select(upright, -state[2], none), policy.limits[2]);
-    for (std::size_t c = 3; c < 6; ++c) {
-        action[c] = limited(select(near, -state[c], none), policy.limits[c]);
-    }
+    action[0] = -state[0];
+    action[1] = -state[1];
+    action[2] = select(upright, -state[2], none);
+    for (std::size_t c = 3; c < 6; ++c) action[c] = select(near, -state[c], none);
 }
 
 HOLDFAST_INLINE IntLanes passed(const PegPolicy3D&, const StageLanes<PegPolicy3D>&,
@@ -100,10 +105,14 @@ HOLDFAST_INLINE Lanes reward(const PegPolicy3D&, const BoxShape&, const Lanes (&
     return minus_norm(action);
 }
 
-HOLDFAST_INLINE void executed(const ViaPointPolicy& policy, const StageLanes<ViaPointPolicy>& stage,
-                              const Lanes (&state)[2], Lanes (&action)[2]) {
-    const Lanes x = stage.number[2] * (stage.number[0] - state[0]);
-    const Lanes y = stage.number[3] * (stage.number[1] - state[1]);
+HOLDFAST_INLINE void commanded(const ViaPointPolicy&, const StageLanes<ViaPointPolicy>& stage,
+                               const Lanes (&state)[2], Lanes (&action)[2]) {
+    action[0] = stage.number[2] * (stage.number[0] - state[0]);
+    action[1] = stage.number[3] * (stage.number[1] - state[1]);
+}
+
+HOLDFAST_INLINE void limit(const ViaPointPolicy& policy, Lanes (&action)[2]) {
+    const Lanes x = action[0], y = action[1];
     const Lanes norm = square_root(x * x + y * y);
     const Lanes longest = splat(policy.step_size);
     const Lanes shortened = longest / select(norm < longest, longest, norm);
@@ -131,6 +140,14 @@ HOLDFAST_INLINE Lanes reward(const ViaPointPolicy&, const DiscShape& shape, cons
                              const Lanes (&action)[2]) {
     const IntLanes hits = discs_hit(shape, state[0] + action[0], state[1] + action[1]);
     return select(hits, splat(-1.0), splat(0.0));
+}
+
+template <class Policy>
+HOLDFAST_INLINE void executed(const Policy& policy, const StageLanes<Policy>& stage,
+                              const Lanes (&state)[Policy::dimension],
+                              Lanes (&action)[Policy::dimension]) {
+    commanded(policy, stage, state, action);
+    limit(policy, action);
 }
 
 /// The states and actions of `Policy` at [begin, begin + 8), side by side.
@@ -252,10 +269,20 @@ static std::uint32_t act(const Policy& policy, const Shape& shape, const Way& wa
         // Who is near asks again, also after a step that only turns.
         store(way.room + begin, select(near, splat(-1.0), room - farthest));
         if (const unsigned bits = bits_of(near) & own; bits != 0) {
-            hits |= static_cast<std::uint32_t>(bits & bits_hit(shape, next)) << begin;
+            hits |= static_cast<std::uint32_t>(bits_hit(shape, next, bits)) << begin;
         }
     }
     return hits;
+}
+
+template <class Policy>
+static void command(const Policy& policy, const Way& way) {
+    for (std::size_t begin = 0; begin < way.count; begin += lane_count) {
+        Lanes state[Policy::dimension], action[Policy::dimension];
+        load_columns(way.states, way_stride, begin, state);
+        commanded(policy, StageLanes<Policy>(policy, way.stages + begin), state, action);
+        store_columns(way.actions, way_stride, begin, action);
+    }
 }
 
 template <class Policy>
@@ -297,8 +324,8 @@ static void clearances(const RoundShape& shape, const double* states, std::size_
 
 template <class Policy, class Shape>
 constexpr PolicyKernels<Policy, Shape> steps_of{
-    decide<Policy>,     judge<Policy, Shape>, walk<Policy, Shape>,
-    clearances<Policy>, act<Policy, Shape>,   arrive<Policy>,
+    decide<Policy>,     judge<Policy, Shape>, walk<Policy, Shape>, clearances<Policy>,
+    act<Policy, Shape>, arrive<Policy>,       command<Policy>,
 };
 
 }  // namespace holdfast::inline HOLDFAST_ISA

@@ -175,24 +175,27 @@ class _World(KeepsReadOnly):
         offsets: Sequence[int],
         tolerance: float,
         threads: int,
+        *,
+        commands: bool = False,
     ) -> tuple[FloatArray, IntArray]:
         """Follow a policy of the kernel without noise, from each of n states independently.
 
-        All begin in one stage. The result, the states (K, n, d) and stages (K, n) after K numbers
-        of steps (``offsets``, ascending), equals, bit for bit, repeated calls of the problem's
-        policy, limits, motion without noise and next stage; this is much faster. A tolerance of 0
-        is motion without obstacles.
+        All begin in one stage. The result, the states (K, n, d), or with ``commands`` what the
+        policy commands in them, and stages (K, n) after K numbers of steps (``offsets``,
+        ascending), equals repeated calls of the problem's policy, limits, motion without noise and
+        next stage, bit for bit but for the signs of commands of 0; this is much faster. A tolerance
+        of 0 is motion without obstacles.
         """
         states = self._rows("states", states)
         if states.ndim != 2:
             raise InvalidValueError(f"states: shape {states.shape}, must be (n, {self.dimension})")
-        states_at = np.empty((len(offsets), *states.shape))
-        stages_at = np.empty(states_at.shape[:2], dtype=np.int64)
+        rows_at = np.empty((len(offsets), *states.shape))
+        stages_at = np.empty(rows_at.shape[:2], dtype=np.int64)
         if not self._kernel.own.follow(
-            policy, states, stage, offsets, tolerance, threads, states_at, stages_at
+            policy, states, stage, offsets, tolerance, threads, commands, rows_at, stages_at
         ):
             _raise_not_finite("states", states)
-        return states_at, stages_at
+        return rows_at, stages_at
 
     def roll_out(
         self,
@@ -213,20 +216,10 @@ class _World(KeepsReadOnly):
         cpp/src/rollouts.hpp has the noise.
         """
         returns = np.empty(estimates.shape[:2])
-        rolled_out = self._kernel.own.roll_out(
-            policy,
-            self._rows("true states", true_states),
-            self._rows("estimates", estimates),
-            self._rows("clouds", clouds),
-            stage,
-            standard_deviation,
-            tolerance,
-            stream.for_motion(),
-            rollouts,
-            threads,
-            returns,
-        )
-        if not rolled_out:
+        given = ("true states", true_states), ("estimates", estimates), ("clouds", clouds)
+        begun = *(self._rows(*each) for each in given), stage
+        noise = standard_deviation, tolerance, stream.for_motion()
+        if not self._kernel.own.roll_out(policy, *begun, *noise, rollouts, threads, returns):
             _raise_not_finite("clouds", clouds)
         return returns
 

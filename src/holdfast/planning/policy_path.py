@@ -56,11 +56,15 @@ def path_points(
         (section, key), reason = unfit
         raise InvalidValueError(f"{section}.{key} {reason}")
     offsets, threads = path_steps(settings), settings.active_sensing.num_cores
-    states_at, stages_at = _followed(problem, states, stage, offsets, threads)
-    points = checked.policy(problem, states_at, stages_at)
+    way = problem, states, stage, offsets, threads
+    if has_own(problem, "_path_actions", ("expected_path", *_STEP)):
+        points = checked.path_actions(*way)
+    else:
+        points = checked.policy(problem, *_followed(*way))
     if settings.selector.actions == "executed":
         points = checked.executed_action(problem, points)
     if (bad := first_unbounded(points.reshape(-1, points.shape[-1]))) is not None:
+        states_at, _ = _followed(*way)
         row, particle = divmod(bad, states.shape[0])
         if not np.isfinite(states_at[row, particle]).all():
             raise ProblemError(
@@ -121,9 +125,7 @@ def nats_of_halving(settings: PlanningSettings) -> float:
 
 def _factors(offsets: tuple[int, ...], discount: float) -> tuple[float, ...]:
     """Return ``discount**offset`` by multiplication, which has the same bits everywhere."""
-    factors = []
-    factor = 1.0
-    before = 0
+    factors, factor, before = [], 1.0, 0
     for offset in offsets:
         for _ in range(offset - before if discount < 1.0 else 0):
             factor *= discount

@@ -588,8 +588,4 @@ def _points_by_stage(
 
 def _row_means(rows: FloatArray) -> FloatArray:
     """Return the mean of each row, added from left to right."""
-    total = np.zeros(rows.shape[0])
-    for column in range(rows.shape[1]):
-        total += rows[:, column]
-    mean: FloatArray = total / rows.shape[1]
-    return mean
+    return np.asarray(functools.reduce(np.add, rows.T) / rows.shape[1])

@@ -183,6 +183,7 @@ class CapsuleRobot(RigidBodyProblem):
         return np.where(self.world.collides(states + actions), -1.0, 0.0)
 
     expected_path = RigidBodyProblem.follow_policy
+    _path_actions = RigidBodyProblem.command_on_path
     rollout_returns = RigidBodyProblem.roll_out_policy
 
     def is_goal(self, states: FloatArray) -> BoolArray:

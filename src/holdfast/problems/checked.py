@@ -312,6 +312,13 @@ def expected_path(
     return states_at, stages_at
 
 
+def path_actions(problem: Any, states: FloatArray, *way: Any) -> FloatArray:
+    """Return the actions commanded along each path: a built-in problem's, in the kernel."""
+    _, offsets, _ = way
+    found = _ask(problem, "_path_actions", states, *way)
+    return _array(problem, "_path_actions", found, (len(offsets), len(states), problem.action_size))
+
+
 def rewards(problem: Any, states: FloatArray, actions: FloatArray) -> FloatArray:
     """Return the rewards of executed actions that led to many states."""
     found = _ask(problem, "reward", states, actions)

@@ -142,6 +142,7 @@ class MultitierPegInHole2D(PegProblem):
         return int(following) if np.ndim(following) == 0 else following
 
     expected_path = PegProblem.follow_policy
+    _path_actions = PegProblem.command_on_path
     rollout_returns = PegProblem.roll_out_policy
 
     def is_goal(self, states: FloatArray) -> BoolArray:

@@ -123,6 +123,7 @@ class PegInHole3D(PegProblem):
         return actions
 
     expected_path = PegProblem.follow_policy
+    _path_actions = PegProblem.command_on_path
     rollout_returns = PegProblem.roll_out_policy
 
     def is_goal(self, states: FloatArray) -> BoolArray:

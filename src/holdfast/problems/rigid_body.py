@@ -167,9 +167,15 @@ class RigidBodyProblem(KeepsReadOnly, ProblemBase):
         A problem makes this its ``expected_path`` beside its own ``policy``: an inherited one
         would not count, for it does not follow a policy that a subclass replaces.
         """
-        return self.world.follow(
-            self._path_policy.own, states, stage, offsets, self._collision_tolerance, threads
-        )
+        way = states, stage, offsets, self._collision_tolerance, threads
+        return self.world.follow(self._path_policy.own, *way)
+
+    def command_on_path(
+        self, states: FloatArray, stage: int, offsets: Sequence[int], threads: int
+    ) -> FloatArray:
+        """Return what the policy commands at each offset of that way, as ``_path_actions``."""
+        way = states, stage, offsets, self._collision_tolerance, threads
+        return self.world.follow(self._path_policy.own, *way, commands=True)[0]
 
     def roll_out_policy(
         self,
@@ -186,18 +192,10 @@ class RigidBodyProblem(KeepsReadOnly, ProblemBase):
         A problem makes this its ``rollout_returns``, as :meth:`follow_policy` its
         ``expected_path``.
         """
-        return self.world.roll_out(
-            self._path_policy.own,
-            true_states,
-            estimates,
-            clouds,
-            stage,
-            self._motion_deviation,
-            max(self._collision_tolerance, _ROLLOUT_TOLERANCE),
-            motion,
-            rollouts,
-            threads,
-        )
+        begun = true_states, estimates, clouds, stage
+        tolerance = max(self._collision_tolerance, _ROLLOUT_TOLERANCE)
+        noise = self._motion_deviation, tolerance, motion
+        return self.world.roll_out(self._path_policy.own, *begun, *noise, rollouts, threads)
 
     def _check_sensing_action(self, sensing_action: int) -> None:
         count = len(self.sensing_actions)

@@ -172,7 +172,7 @@ _MODE_PARTICLES, _MODE_STARTS, _MODE_CLIMBS, _MODE_SPLITS = 1000, 16, 10, 3
 _CLOUD = 8.0
 """Particles that follow each estimate of a rollout."""
 _WEIGHTS_BYTES = 64 << 20
-_GROUP_BYTES = 400
+_GROUP_BYTES = 15.0 * _GROUP  # for each particle
 _GAINS_BYTES = 16 << 20
 _BLOCK = 1 << 20
 """Sizes of the kernel's batches and of :mod:`holdfast.planning.sensing`'s blocks."""
@@ -196,6 +196,7 @@ class _Sizes:
         self.choices = self.senses + selector.sensing_is_optional
         self.samples = float(sensing.num_observation_samples)
         self.general = has_general_observations(problem)
+        self.problem_has_angles = len(getattr(problem, "circular", ())) > 0
         self.state_bytes = 8.0 * self.particles * (self.coordinates + 1.0)
 
     def estimate_s(self) -> float:
@@ -211,10 +212,6 @@ class _Sizes:
                 + _MODE_CLIMBS * _MODE_STARTS * shown * 10.0
             )
         return found * self.unit_s
-
-    @property
-    def problem_has_angles(self) -> bool:
-        return len(getattr(self.problem, "circular", ())) > 0
 
     def act_s(self, times: float) -> float:
         """Return the seconds of so many task actions, each of a belief's estimate."""
@@ -280,12 +277,13 @@ class _Sizes:
         particles = self.particles
         batch = min(posteriors, max(float(_GROUP), (_WEIGHTS_BYTES >> 3) / particles))
         together = max(particles, min(sets * particles, float(_BLOCK)))
-        kept = sets * particles * (8.0 * dimension + 64.0)
+        kept = sets * particles * (24.0 * dimension + 64.0)
         if estimator_of(self.planning.selector, int(particles)) in PRIOR_ESTIMATORS:
             # The posteriors once more, point by point, and what they gain at each of these.
             gains = min(8.0 * sets * batch * particles, float(_GAINS_BYTES))
             return 8.0 * batch * particles + kept + 2.0 * gains
-        return 8.0 * batch * particles + kept + 2.0 * _GROUP_BYTES * together
+        # A quarter and a tenth more: what of these is given back late.
+        return 1.25 * 8.0 * batch * particles + 1.1 * _GROUP_BYTES * together + kept
 
 
 def _cost_of_sensing(sizes: _Sizes) -> Cost:
@@ -304,16 +302,18 @@ def _cost_of_sensing(sizes: _Sizes) -> Cost:
     if sizes.general:
         predicted = 16.0 * posteriors * sizes.particles
     num_bytes = 4.0 * sizes.state_bytes + predicted + 16.0 * posteriors
+    way_bytes = 0.0
     if method == "path_entropy":
         offsets = path_steps(planning)
         sets = float(len(offsets))
         seconds += _path_s(sizes, float(max(offsets, default=0)))
-        num_bytes += sets * sizes.particles * 8.0 * (2.0 * sizes.coordinates + 4.0 * dimension + 2)
+        way_bytes = sets * sizes.particles * 8.0 * (2.0 * sizes.coordinates + 4.0 * dimension + 2)
     if method in ENTROPY_METHODS and len(getattr(sizes.problem, "circular_actions", ())):
         seconds += sets * sizes.particles * dimension * 150.0 * sizes.unit_s
     seconds += own.act.of(sets * sizes.particles)
     seconds += sizes.entropies_s(posteriors, sets, dimension)
-    num_bytes += sizes.entropy_bytes(posteriors, sets, dimension)
+    # The way is over before the entropies begin.
+    num_bytes += max(way_bytes, sizes.entropy_bytes(posteriors, sets, dimension))
     later = float(planning.active_sensing.horizon - 1)
     if later > 0.0:
         each = (
