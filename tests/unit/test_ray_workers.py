@@ -95,7 +95,7 @@ def test_it_finds_the_same_and_outlives_its_actors(
         for place in (("--jobs", "1"), ("--ray", address)):
             (tmp_path / "flag").unlink(missing_ok=True)
             out = f"out{len(kept)}"
-            said = holdfast(tmp_path, *words, *place, "--budget", "120s", "--out", out)
+            said = holdfast(tmp_path, *words, *place, "--budget", "600s", "--out", out)
             assert said.returncode == 0, said.stderr
             assert "90 particles was left out: it died: its process " in said.stdout
             with (tmp_path / out / "trials.csv").open(newline="") as file:
