@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <limits>
+#include <optional>
 #include <vector>
 
 #include "belief_update.hpp"
@@ -60,14 +61,32 @@ Particles particles_of(const Input<2>& states, const Input<1>& weights) {
     return {states.shape(0), states.shape(1), states.data(), weights.data()};
 }
 
-/// Makes log-likelihoods posterior weights. Returns how many are not zero, and the sizes of the
-/// belief that has them, or of the one before if none is.
-template <class... Further>
-nb::tuple reweighed(Particles particles, double* values, Further... further) {
+/// Lets other threads of Python run while so many numbers are worth the switch.
+class ReleaseForMany {
+  public:
+    explicit ReleaseForMany(std::size_t numbers) {
+        if (numbers >= 8192) release_.emplace();
+    }
+
+  private:
+    std::optional<WithoutInterpreter> release_;
+};
+
+struct Posterior {
+    std::size_t survivors;  // weights that are not zero
+    BeliefSizes sizes;      // of the belief that has them, or of the one before if none is
+};
+
+/// Makes log-likelihoods posterior weights.
+Posterior posterior_of(Particles particles, double* values) {
     const std::size_t survivors = reweigh(particles, values);
     if (survivors > 0) particles.weights = values;
-    const BeliefSizes sizes = sizes_of(particles);
-    return nb::make_tuple(survivors, sizes.effective, sizes.distinct, further...);
+    return {survivors, sizes_of(particles)};
+}
+
+template <class... Further>
+nb::tuple told(const Posterior& found, Further... further) {
+    return nb::make_tuple(found.survivors, found.sizes.effective, found.sizes.distinct, further...);
 }
 
 /// None if a mean is not finite, or a variance not positive and finite.
@@ -82,14 +101,21 @@ nb::object update_by_gaussian(const Input<2>& states, const Input<1>& weights,
     require(mean.shape(0) == count && mean.shape(1) == size && posterior.shape(0) == count &&
                 variance.size() == (varies ? count * size : size),
             "shapes differ");
-    if (!are_within(mean.data(), mean.size(), -largest, largest) ||
-        !are_within(variance.data(), variance.size(), smallest, largest)) {
-        return nb::none();
+    const GaussianObservation given{size,   observed.data(), mean.data(), variance.data(),
+                                    varies, circular};
+    bool usable;
+    double nearest = 0.0;
+    Posterior found{};
+    {
+        const ReleaseForMany release(count * size);
+        usable = are_within(given.mean, mean.size(), -largest, largest) &&
+                 are_within(given.variance, variance.size(), smallest, largest);
+        if (usable) {
+            nearest = gaussian_log_likelihood(particles, given, posterior.data());
+            found = posterior_of(particles, posterior.data());
+        }
     }
-    const double nearest = gaussian_log_likelihood(
-        particles, {size, observed.data(), mean.data(), variance.data(), varies, circular},
-        posterior.data());
-    return reweighed(particles, posterior.data(), nearest);
+    return usable ? nb::object(told(found, nearest)) : nb::none();
 }
 
 }  // namespace
@@ -134,7 +160,13 @@ void holdfast::bind_numerics(nb::module_& module) {
         module, "update",
         [](const Input<2>& states, const Input<1>& weights, InPlace<double, 1> log_likelihood) {
             require(log_likelihood.shape(0) == weights.shape(0), "shapes differ");
-            return reweighed(particles_of(states, weights), log_likelihood.data());
+            const Particles particles = particles_of(states, weights);
+            Posterior found;
+            {
+                const ReleaseForMany release(particles.count);
+                found = posterior_of(particles, log_likelihood.data());
+            }
+            return told(found);
         },
         nb::arg("states"), nb::arg("weights"), nb::arg("log_likelihood").noconvert());
     define(module, "update_by_gaussian", &update_by_gaussian, nb::arg("states"), nb::arg("weights"),
@@ -178,6 +210,7 @@ void holdfast::bind_numerics(nb::module_& module) {
             require(drawn.shape(0) == count && drawn.shape(1) == particles.dimension &&
                         drawn_weights.shape(0) == count,
                     "shapes differ");
+            const ReleaseForMany release(count * particles.dimension);
             resample(particles, uniform(to_stream(words), 0), drawn.data());
             std::fill_n(drawn_weights.data(), count, 1.0 / static_cast<double>(count));
         },

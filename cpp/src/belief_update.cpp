@@ -34,9 +34,9 @@ BeliefSizes sizes_of(const Particles& particles) {
 double gaussian_log_likelihood(const Particles& particles, const GaussianObservation& in,
                                double* log_likelihood) {
     const std::size_t count = particles.count;
-    double* distance = log_likelihood;  // first
+    double* distance = log_likelihood;  // they stand where the log-likelihoods will
     std::fill_n(distance, count, 0.0);
-    // Column by column: the order in which they are added is part of the result.
+    // Each particle's, coordinate after coordinate: the order is part of the result.
     for (std::size_t c = 0; c < in.size; ++c) {
         const bool is_angle = std::count(in.circular.begin(), in.circular.end(), c) > 0;
         for (std::size_t i = 0; i < count; ++i) {

@@ -1,4 +1,4 @@
-// Bayes' rule on weighted particles, in one pass of the kernel.
+// Bayes' rule on weighted particles, in one call of the kernel.
 //
 // An observation is folded in at every sensing step, by the robot and by the service, often with
 // cold caches: there each function on the way costs microseconds, whatever it does. So likelihood,

@@ -34,7 +34,7 @@ class TestMadeBesideItsPlace:
         (tmp_path / "full" / "file").touch()
         (tmp_path / "made").mkdir()
         with pytest.raises(OutputError, match="full: cannot be written: Directory not empty"):
-            move_into_place(tmp_path / "made", tmp_path / "full")
+            move_into_place([(tmp_path / "made", tmp_path / "full")])
 
     @pytest.mark.parametrize("directory", [False, True])
     def test_a_place_must_be_free(self, directory: bool, tmp_path: Path) -> None:

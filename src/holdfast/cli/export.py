@@ -214,8 +214,7 @@ def _write(recorded: RecordedRun, trials: Sequence[int], options: ExportOptions)
             file = stack.enter_context(directory_beside(options.figure)) / "figure"
             file.write_bytes(picture)
             made.append((file, options.figure))
-        for here, there in made:
-            move_into_place(here, there)
+        move_into_place(made)
     return notes
 
 

@@ -76,5 +76,5 @@ def _view(options: ViewOptions) -> None:
         ) as sink:
             export.replay_trials(recorded, trials, [sink], quiet=options.quiet)
         if save is not None and made is not None:
-            move_into_place(made, save)
+            move_into_place([(made, save)])
     export.print_written([] if options.quiet else notes, save)

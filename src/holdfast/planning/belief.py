@@ -227,7 +227,7 @@ def update(
         within_gate = possible = _is_possible(belief, log_likelihood)
         if possible and rank_stream is not None:
             within_gate = _is_typical(problem, belief, sensing_action, log_likelihood, rank_stream)
-        sizes = _kernel.update(*belief, log_likelihood)
+        sizes = _kernel.update(*belief, log_likelihood)  # which is now the posterior weights
         return _updated(belief, log_likelihood, sizes, possible, None, within_gate)
     mean, variance = checked.prediction(problem, belief.states, sensing_action)
     size = mean.shape[-1]
@@ -288,7 +288,7 @@ def update_by_move(
     observed = finite(observation)
     log_likelihood = checked.move_log_likelihood(problem, belief.states, task_action, observed)
     possible = _is_possible(belief, log_likelihood)
-    sizes = _kernel.update(*belief, log_likelihood)
+    sizes = _kernel.update(*belief, log_likelihood)  # which is now the posterior weights
     return _updated(belief, log_likelihood, sizes, possible, None, possible)
 
 

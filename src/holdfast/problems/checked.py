@@ -43,7 +43,7 @@ def prediction(
     """Return the mean and the variance of the observation in each state.
 
     The mean has the shape ``(..., observation_size)``, and the variance that or
-    ``(observation_size,)``. Whether they are finite is left to :func:`require_usable`.
+    ``(observation_size,)``. Whether they are finite is left to the caller.
     """
     mean = _mean(problem, states, sensing_action).copy()
     variance = _variance(problem, states, sensing_action, mean.shape)

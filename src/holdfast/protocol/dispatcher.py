@@ -127,7 +127,7 @@ class Dispatcher(DecisionSource):
 
     def drop(self) -> None:
         """Drop the question: the trial has ended, or its answer is of no use."""
-        self.question = None
+        super().drop()
         for call in self._calls:
             if call.answered or call.replica is self._services.local:
                 self._calls.abandon(call)

@@ -254,7 +254,7 @@ class DecisionSource:
 
     def drop(self) -> None:
         """Drop the question: the trial has ended, or its answer is of no use."""
-        self.question = None
+        self.question = self.needed_at = None
 
     def recompute(self) -> None:
         """Have the own planner answer the question too."""

@@ -160,7 +160,7 @@ class Service:
             return []  # handed out before everything was forgotten
         task, started_at = lane.end(job)
         session = task.session
-        is_awaited = session.pending.get(task.digest) is task
+        is_pending = session.pending.get(task.digest) is task
         session.remove_task(task)
         price = outcome.price
         if job.expected_s == math.inf:
@@ -176,7 +176,7 @@ class Service:
             self._statistics.sessions_opened += session.built and not typical
             session.price = price or session.price
             if outcome.cancelled or outcome.postponed is not None:
-                if is_awaited:
+                if is_pending:
                     self._postpone(task, job, outcome.postponed, now)
             elif outcome.failure is not None or outcome.lacks_state:
                 self._failed(task, outcome)
@@ -185,7 +185,7 @@ class Service:
                 session.overran = session.overran and computed_s > self._queue.limits_s[MEDIUM]
                 if outcome.restored:
                     # A particle in an obstacle, say, takes a thousand times as long to move.
-                    session.times[False].expect_long()
+                    session.times[0].expect_long()  # of task parts
                 if typical and task.lane <= BRIEF:
                     # What new robots are expected to take.
                     self._times[task.sensing].learn(computed_s)

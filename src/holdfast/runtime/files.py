@@ -16,7 +16,7 @@ import errno
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -232,12 +232,15 @@ def directory_beside(path: Path) -> Iterator[Path]:
         yield temporary
 
 
-def move_into_place(made: Path, path: Path) -> None:
-    """Write a file, or a directory of files, through to the disk, and rename it to its path."""
-    with _refusals(path, "written"):
-        for file in sorted(made.iterdir()) if made.is_dir() else [made]:
-            synchronize(file)
-        made.rename(path)
+def move_into_place(moves: Sequence[tuple[Path, Path]]) -> None:
+    """Write files, or directories of files, through to the disk, then rename each to its path."""
+    for made, path in moves:
+        with _refusals(path, "written"):
+            for file in sorted(made.iterdir()) if made.is_dir() else [made]:
+                synchronize(file)
+    for made, path in moves:
+        with _refusals(path, "written"):
+            made.rename(path)
 
 
 def synchronize(path: Path) -> None:
