@@ -16,16 +16,46 @@ import resource
 import statistics
 import tracemalloc
 from time import thread_time
+from typing import get_args
 
-from tests.fuzz.hostile_settings import random_settings
+from tests.fuzz.hostile_settings import made_fit, with_key
 
 from holdfast.config import registry
 from holdfast.config.registry import BUILT_IN
 from holdfast.errors import HoldfastError
 from holdfast.planning.planner import Planner
+from holdfast.planning.settings import Estimator, Method, PlanningSettings
 from holdfast.protocol.decision_cost import Pricing, describe_cost
 from holdfast.protocol.service_sessions import with_cores
 from holdfast.service.calibration import measure_problem, measure_slowness
+
+
+def random_settings(chance: random.Random) -> PlanningSettings:
+    """Return settings whose costly numbers are drawn by their logarithms; others stay."""
+    settings = PlanningSettings()
+
+    def drawn(least: int, greatest: int) -> int:
+        return round(least * math.exp(math.log(greatest / least) * chance.random()))
+
+    values: dict[str, object] = {
+        "selector.method": chance.choice(get_args(Method)),
+        "selector.estimator": chance.choice((None, *get_args(Estimator))),
+        "selector.resolution": chance.choice((None, 10.0 ** chance.uniform(-4.0, 3.0))),
+        "selector.sensing_is_optional": chance.random() < 0.3,
+        "particle_filter.num_particles": drawn(30, 30_000),
+        "particle_filter.estimate": chance.choice(("mean", "mean", "heaviest_mode")),
+        "active_sensing.num_observation_samples": drawn(1, 200),
+        "active_sensing.num_nearest_neighbors": drawn(1, 300) if chance.random() < 0.4 else 5,
+        "active_sensing.horizon": drawn(1, 30),
+        "selector.rollout_steps": drawn(1, 2000),
+        "selector.rollout_sensing_steps": drawn(1, 100),
+        "selector.max_observation_samples": drawn(1, 400),
+        "selector.path_offsets": tuple(range(drawn(1, 16))),
+        "sensing_interval": drawn(1, 60),
+    }
+    for key, value in values.items():
+        settings = with_key(settings, key, value)
+    return made_fit(settings)
 
 
 def main() -> None:

@@ -1,8 +1,6 @@
 """Settings that cost as much as they can, found by looking at the settings' own bounds."""
 
 import itertools
-import math
-import random
 from collections.abc import Iterator
 from typing import NamedTuple, get_args
 
@@ -78,7 +76,7 @@ def _greatest(bounds: NumericKey) -> object:
     return tuple(range(int(most) - bounds.length + 1, int(most) + 1))
 
 
-def _made_fit(settings: PlanningSettings) -> PlanningSettings:
+def made_fit(settings: PlanningSettings) -> PlanningSettings:
     """Change what the method cannot use, but for what costs."""
     for _ in range(8):
         particles = settings.particle_filter.num_particles
@@ -115,38 +113,6 @@ def hostile_settings(most_particles: int = 1_000_000) -> Iterator[Hostile]:
         plain = with_key(plain, "selector.estimator", estimator)
         everything = plain
         for key, value in greatest.items():
-            yield Hostile(key, _made_fit(with_key(plain, key, value)))
+            yield Hostile(key, made_fit(with_key(plain, key, value)))
             everything = with_key(everything, key, value)
-        yield Hostile("all", _made_fit(everything))
-
-
-def random_settings(chance: random.Random, most: float = 1.0) -> PlanningSettings:
-    """Return settings whose costly numbers are drawn, by their logarithms, up to a share of most.
-
-    What changes no cost stays as it is.
-    """
-    settings = PlanningSettings()
-
-    def drawn(least: int, greatest: int) -> int:
-        growth = 1.0 + most * (greatest / least - 1.0)
-        return round(least * math.exp(math.log(growth) * chance.random()))
-
-    values: dict[str, object] = {
-        "selector.method": chance.choice(get_args(Method)),
-        "selector.estimator": chance.choice((None, *get_args(Estimator))),
-        "selector.resolution": chance.choice((None, 10.0 ** chance.uniform(-4.0, 3.0))),
-        "selector.sensing_is_optional": chance.random() < 0.3,
-        "particle_filter.num_particles": drawn(30, 30_000),
-        "particle_filter.estimate": chance.choice(("mean", "mean", "heaviest_mode")),
-        "active_sensing.num_observation_samples": drawn(1, 200),
-        "active_sensing.num_nearest_neighbors": drawn(1, 300) if chance.random() < 0.4 else 5,
-        "active_sensing.horizon": drawn(1, 30),
-        "selector.rollout_steps": drawn(1, 2000),
-        "selector.rollout_sensing_steps": drawn(1, 100),
-        "selector.max_observation_samples": drawn(1, 400),
-        "selector.path_offsets": tuple(range(drawn(1, 16))),
-        "sensing_interval": drawn(1, 60),
-    }
-    for key, value in values.items():
-        settings = with_key(settings, key, value)
-    return _made_fit(settings)
+        yield Hostile("all", made_fit(everything))

@@ -6,6 +6,7 @@
 
 Each line is answered by one with its id and either ``result`` or ``error``. Calls are made by a
 thread that is not the executor's, as a robot's loop makes them; ``cancel`` is not queued.
+``cancel_once_accepted`` cancels as soon as the robot has accepted a task action.
 """
 
 from __future__ import annotations
@@ -59,6 +60,17 @@ def main() -> None:
                 timeout_ms=command.get("timeout_ms", 60_000.0),
                 discovery_timeout_ms=command.get("discovery_timeout_ms", 5000.0),
             )
+            return None
+        if command["do"] == "cancel_once_accepted":
+            client = environment._act_call.clients[0]
+            send = client.call_async
+
+            def sent(goal: Any) -> Any:
+                answer = send(goal)
+                answer.add_done_callback(lambda _: connections.cancel())
+                return answer
+
+            client.call_async = sent
             return None
         arguments = command.get("arguments", [])
         if command["do"] == "perform":

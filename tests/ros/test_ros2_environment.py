@@ -215,9 +215,13 @@ class TestRobotsThatFail:
         assert robot.next_line().startswith("moving")
         assert robot.next_line() == "cancelled\n"
 
-    def test_an_action_is_cancelled_from_another_thread(self, driver: Driver, odd: Start) -> None:
+    @pytest.mark.parametrize("before", ["is_done", "cancel_once_accepted"])
+    def test_an_action_is_cancelled_from_another_thread(
+        self, driver: Driver, odd: Start, before: str
+    ) -> None:
         robot = odd(act="slow")
         driver.do("make")
+        driver.do(before)
         acting = driver.begin("perform", ACTION)
         assert robot.next_line().startswith("moving")
         driver.do("cancel")
