@@ -227,8 +227,7 @@ def update(
         within_gate = possible = _is_possible(belief, log_likelihood)
         if possible and rank_stream is not None:
             within_gate = _is_typical(problem, belief, sensing_action, log_likelihood, rank_stream)
-        sizes = _kernel.update(*belief, log_likelihood)  # which is now the posterior weights
-        return _updated(belief, log_likelihood, sizes, possible, None, within_gate)
+        return _reweighed(belief, log_likelihood, possible, within_gate)
     mean, variance = checked.prediction(problem, belief.states, sensing_action)
     size = mean.shape[-1]
     if size != observed.shape[0]:
@@ -288,8 +287,7 @@ def update_by_move(
     observed = finite(observation)
     log_likelihood = checked.move_log_likelihood(problem, belief.states, task_action, observed)
     possible = _is_possible(belief, log_likelihood)
-    sizes = _kernel.update(*belief, log_likelihood)  # which is now the posterior weights
-    return _updated(belief, log_likelihood, sizes, possible, None, possible)
+    return _reweighed(belief, log_likelihood, possible, possible)
 
 
 def finite(observation: npt.ArrayLike) -> FloatArray:
@@ -300,6 +298,14 @@ def finite(observation: npt.ArrayLike) -> FloatArray:
             f"observation {in_brief(observed)}: every coordinate must be finite"
         )
     return observed
+
+
+def _reweighed(
+    belief: Belief, log_likelihood: FloatArray, explained: bool, within_gate: bool
+) -> tuple[Belief, ObservationInfo]:
+    """Update a belief by a general likelihood, whose array becomes the posterior weights."""
+    sizes = _kernel.update(*belief, log_likelihood)
+    return _updated(belief, log_likelihood, sizes, explained, None, within_gate)
 
 
 def _updated(
