@@ -304,6 +304,12 @@ def state_labels(problem: Any) -> tuple[str, ...]:
     return tuple(map(str, labels))
 
 
+def coordinate_name(problem: Any, number: int) -> str:
+    """Return what messages call a coordinate of a state."""
+    labels = state_labels(problem)
+    return labels[number] if labels else f"coordinate {number} of a state"
+
+
 def circular_states(problem: Any) -> Sequence[int]:
     """Return which coordinates of a state are angles."""
     return _indices(getattr(problem, "circular", ()))

@@ -25,7 +25,7 @@ from holdfast.numerics.randomness import Purpose, Stream, stream
 from holdfast.planning.planner import PlanningState
 from holdfast.planning.settings import PlanningSettings
 from holdfast.printable import one_line
-from holdfast.problems.attributes import sensing_labels, state_labels
+from holdfast.problems.attributes import coordinate_name, sensing_labels
 
 FALSE_ALARM_RATE = 0.001  # probability that all tests of a right problem together find an error
 OVER = "not looked at, or not at all of it: the time was over"  # of what the budget has cut short
@@ -134,8 +134,7 @@ class Inspection:
 
     def coordinate(self, number: int) -> str:
         """Return what messages call a coordinate of a state."""
-        labels = state_labels(self.problem)
-        return labels[number] if labels else f"coordinate {number} of a state"
+        return coordinate_name(self.problem, number)
 
     def deadline(self, share: float, check: str = "") -> Callable[[], bool]:
         """Return a function that tells whether a check, if named, is over its share of the time."""

@@ -24,12 +24,16 @@ SETTINGS_NAME = "tune.json"
 
 
 class TrialRow(NamedTuple):
-    """What is kept of a trial; ``decision_ms`` is the median of its sensing decisions."""
+    """What is kept of a trial; ``decision_ms`` is the median of its sensing decisions.
+
+    ``sure_of_wrong`` is whether it has lost values (:mod:`holdfast.robot.lost_values`).
+    """
 
     candidate: str
     trial: int
     success: bool
     failed: bool
+    sure_of_wrong: bool
     steps: int
     reward: float | None
     decision_ms: float

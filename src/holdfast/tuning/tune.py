@@ -29,8 +29,10 @@ from holdfast.errors import InvalidValueError, TrialCrashError, TrialError, Work
 from holdfast.journal.fingerprint import fingerprint
 from holdfast.numerics.arrays import FloatArray, real_number, whole
 from holdfast.printable import brief
+from holdfast.robot.lost_values import are_many
 from holdfast.robot.trial_pool import Arm, TrialPool
 from holdfast.runtime.command_line import MAX_JOBS
+from holdfast.runtime.files import shown_path
 from holdfast.runtime.machine import available_cores
 from holdfast.runtime.ray_workers import RayCluster
 from holdfast.tuning.candidates import (
@@ -237,7 +239,7 @@ class _Tuner:
         verdict = judge(
             rows, finalists, self.objective, self._limit, barred, min(most, _LEAST_FRESH)
         )
-        sentence = verdict.sentence
+        sentence = verdict.sentence + self._note_on_lost_values(rows[verdict.choice])
         left_out |= self._failed
         for name, reason in list(left_out.items())[:_MOST_REFUSED]:
             sentence += f" {name} was left out: {reason.splitlines()[0]}."
@@ -262,6 +264,18 @@ class _Tuner:
             fresh_trials=fresh,
             comparisons=verdict.comparisons,
             candidates=tuple(map(self._row, standings)),
+        )
+
+    def _note_on_lost_values(self, rows: Sequence[TrialRow]) -> str:
+        if not are_many(lost := sum(row.sure_of_wrong for row in rows), len(rows)):
+            return ""
+        more = 10 * self.base.planning.particle_filter.num_particles
+        command = (
+            f"holdfast tune {shown_path(self.base.path)} --set particle_filter.num_particles={more}"
+        )
+        return (
+            f" But {lost} of its {len(rows)} trials ended sure of a wrong value: particles are too "
+            f"few, and more may gain more than any method: {command}."
         )
 
     def _spent_s(self) -> float:
@@ -389,6 +403,7 @@ class _Tuner:
                         finished.trial,
                         result.success,
                         result.failed,
+                        bool(finished.lost_values),
                         result.steps,
                         result.reward,
                         float(np.median(result.sensing_ms)) if result.sensing_ms else 0.0,
