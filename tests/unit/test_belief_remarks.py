@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from tests.line_problem import SETTINGS, Line
 from tests.recordings import record_trial
+from tests.unit.test_lost_values import RANDOM, Bit
 
 from holdfast.config.loader import Configuration, load
 from holdfast.numerics.arrays import FloatArray, IntArray
@@ -50,6 +51,43 @@ class TestSeveralModes:
         assert "had several modes, and the mean lies between them" in remark
         assert "particle_filter.estimate: heaviest_mode" in remark
         assert not remarks_of("corridor_anywhere", trial)
+
+    def test_the_mean_of_zeros_and_ones_is_a_probability(self) -> None:
+        assert not any(bits_of((4.0, 1e6), hidden=False))
+
+
+def bits_of(variances: tuple[float, float], *, hidden: bool) -> list[str]:
+    """Return the remarks on twelve trials with a bit, of a robot whose world is ``hidden``."""
+    problem, found = Bit(), []
+    problem.variances = variances
+    for trial in range(12):
+        recorder = Recorder(trial, planner := Planner(problem, RANDOM))
+        run_trial(planner, 3, trial, max_steps=20, observer=recorder)
+        if hidden:
+            recorder.record.true_states.clear()
+        (*remarks,) = belief_remarks(problem, RANDOM, recorder.record)
+        assert hidden or bool(remarks) == bool(recorder.coordinates)
+        assert not belief_remarks(problem, RANDOM, recorder.record, lost_are_told=True) or hidden
+        found.append(" ".join(remarks))
+    return found
+
+
+class TestBits:
+    """Certainty by chance and by evidence, where the truth is known and where it is not."""
+
+    def test_by_chance(self) -> None:
+        says = "{} value of bit at the end. Resampling loses such a value by chance"
+        known, unknown = (bits_of((1e-8, 4.0), hidden=hidden) for hidden in (False, True))
+        found = [each for each in known if each]
+        assert 1 < len(found) < 12
+        assert all(each.startswith(says.format("no particle had the true")) for each in found)
+        found = [each for each in unknown if each]
+        assert len(found) > 8
+        assert all(each.startswith(says.format("chance left one")) for each in found)
+
+    def test_by_evidence(self) -> None:
+        for hidden in (False, True):
+            assert not any(bits_of((4.0, 1e-4), hidden=hidden))
 
 
 class TestAngles:
@@ -102,7 +140,7 @@ class TestDepletion:
     def test_what_does_not_move_is_told(self) -> None:
         (remark,), result, _ = self.recorded(Beacon())
         assert remark.startswith("beacon (m) does not move, and by step 58 its particles had 1 ")
-        assert "docs/problems.md, What does not move" in remark
+        assert "docs/problems.md, Parameters that never change" in remark
         # The robot's own coordinate is another one in each particle.
         assert result.fewest_distinct_particles == 30
 

@@ -47,6 +47,10 @@ WHERE = {
 _REMEDIES = (
     ("read-only", "It changes the array that it is given. Take a copy: states = states.copy()."),
     ("TimeoutError", "Look for a loop that need not end, such as one that draws until it fits."),
+    (
+        r"array of shape \(n,\)",
+        "It is asked for one state: return an array with one axis, np.array([value]) of a number.",
+    ),
     ("a stream is for", "Draw from the stream of this call alone, and do not keep it."),
     (
         "something else|global generator",
@@ -207,7 +211,7 @@ class Inspection:
             seen = seen if function in seen else f"{function}: {seen}"
         # One finding for what is broken, whoever calls it and with whatever states.
         frames = re.findall(r'^  File "(.+)", line \d+, in (.+)$', details, re.MULTILINE)
-        named = re.match(r"(\w+) of ", seen)
+        named = re.search(r"(?:^|: )(\w+) of ", seen)
         to_blame = " ".join(frames[-1]) if frames else named[1] if named else f"{function} {check}"
         if to_blame in self._blamed:
             return

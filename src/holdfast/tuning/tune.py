@@ -54,7 +54,7 @@ from holdfast.tuning.kept_trials import FRESH, TRIALS_NAME, KeptTrials, TrialRow
 from holdfast.tuning.race import PILOT_TRIALS, MeasuredTrial, Standing, race
 from holdfast.tuning.tuning_report import CandidateRow, Tuning, write_report
 from holdfast.tuning.verdict import MUCH_SLOWER, cost_of, judge, mean_difference
-from holdfast.validation import as_function, as_path
+from holdfast.validation import as_function, as_path, close_match
 
 _SHARE_OF_THE_RACE = 0.6
 _LEAST_FRESH = 20
@@ -134,7 +134,8 @@ def tune(
     for each in vary if isinstance(vary, list | tuple) else [vary]:
         if not isinstance(each, str) or each not in VARIATIONS:
             allowed = ", ".join(VARIATIONS)
-            raise InvalidValueError(f"vary has {brief(each)}; allowed are {allowed}")
+            hint = close_match(str(each), VARIATIONS)
+            raise InvalidValueError(f"vary has {brief(each)}; allowed are {allowed}{hint}")
     as_function("on_progress", on_progress)
     most = whole("most", most, 2, FRESH - 1)
     jobs = None if jobs is None else whole("jobs", jobs, 1, MAX_JOBS)
