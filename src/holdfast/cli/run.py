@@ -71,7 +71,6 @@ def _run(options: RunOptions) -> int:
         latest_default_directory,
     )
     from holdfast.planning.planner import Planner
-    from holdfast.problems.attributes import coordinate_name
     from holdfast.reports.belief_remarks import belief_remarks
     from holdfast.reports.recorder import Recorder
     from holdfast.robot.environment_maker import load_environment
@@ -126,7 +125,7 @@ def _run(options: RunOptions) -> int:
         recorder = Recorder(0, Planner(configuration.problem, configuration.planning))
         robot = RobotFindings()
         summary: RunSummary | None = None
-        lost: list[tuple[int, ...]] = []
+        lost: list[tuple[str, ...]] = []
         started = perf_counter()
 
         def on_result(result: TrialResult) -> None:
@@ -209,8 +208,7 @@ def _run(options: RunOptions) -> int:
             notes.note(remark.text)
         with notes.instead_of_errors("remarks on the beliefs"):
             problem, record = configuration.problem, recorder.record
-            named = [[coordinate_name(problem, at) for at in each] for each in lost]
-            if told := remark_on_lost_values(named):
+            if told := remark_on_lost_values(lost):
                 notes.note(f"{told}. {REMEDY}")
             planning, is_told = configuration.planning, bool(told)
             for text in belief_remarks(problem, planning, record, lost_are_told=is_told):
@@ -235,21 +233,12 @@ def _run(options: RunOptions) -> int:
 
 
 class RobotFindings:
-    """An event sink, for what a robot's run finds besides its results.
-
-    Attributes
-    ----------
-    missed_ticks : int
-        Ticks of ``--rate`` that came late.
-    refusals : dict of str
-        Why a service was given up, by its name.
-    unreachable : dict of str
-        Why a service could not be reached the last time, by its name.
-    """
+    """An event sink, for what a robot's run finds besides its results."""
 
     def __init__(self, on_first_hold: Callable[[], None] = lambda: None) -> None:
         self._on_hold: Callable[[], None] | None = on_first_hold
-        self.missed_ticks = 0
+        self.missed_ticks = 0  # ticks of --rate that came late
+        # Why a service was given up, and could not be reached the last time, by its name.
         self.refusals: dict[str, str] = {}
         self.unreachable: dict[str, str] = {}
 

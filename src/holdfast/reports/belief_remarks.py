@@ -22,15 +22,13 @@ from holdfast.planning.settings import PlanningSettings
 from holdfast.problems.attributes import circular_states, coordinate_name, name_of, state_labels
 from holdfast.reports.recorder import TrialRecord
 from holdfast.robot.lost_values import REMEDY
+from holdfast.robot.trial import SensingStep
 
 _SHARE = 0.2
 """Share of the beliefs after an observation from which on a remark is made."""
 
 _FEW = 0.03
 """Share of its first values that a depleted coordinate still has, at most."""
-
-_ENOUGH = 0.1
-"""Share of the particles that count effectively, below which a few copies look like modes."""
 
 _FEW_EFFECTIVE = 3.0
 """Effective particles below which chance decides what an observation leaves of few values."""
@@ -47,9 +45,9 @@ def belief_remarks(
     reported where the trial failed: a sharp observation may leave particles in a few heaps, too,
     which does no harm; coordinates of zeros and ones do not count, whose mean is a probability. A
     coordinate that does not move is reported if hardly any of the values are left that its
-    particles had at first. If these were few, as those of a switch, certainty may be right: it is
-    reported, unless ``lost_are_told``, if the true value is lost; and where that is not known, if
-    all others fell out at an observation that left few effective particles.
+    particles had at first. If these were few, as those of a switch, certainty may be right: what is
+    reported is the loss of the true value, unless ``lost_are_told``; and where that is not known, a
+    single value that is left by an observation that left few effective particles.
     """
     count = len(record.sensing)
     remarks: list[str] = []
@@ -64,28 +62,19 @@ def belief_remarks(
                 f"averaged as a number: give {name_of(problem)} circular = ({coordinate},), so "
                 "that pi is -pi"
             )
-    depleted, by_chance = _depleted(record)
-    lost = by_chance if not record.true_states else () if lost_are_told else record.lost_values
-    if lost:
-        how = "no particle had the true value" if record.true_states else "chance left one value"
-        names = ", ".join(coordinate_name(problem, at) for at in lost)
-        remarks.append(f"{how} of {names} at the end. {REMEDY}")
-    for at, least, step in depleted:
+    if record.lost_values and not lost_are_told:
+        names = ", ".join(record.lost_values)
+        remarks.append(f"no particle had the true value of {names} at the end. {REMEDY}")
+    for at, least, step in _depleted(record):
         remarks.append(
             f"{coordinate_name(problem, at)} does not move, and by step {step} its particles had "
             f"{least} different values left, of which the belief may be certain and wrong: if it "
             f"is continuous, give {name_of(problem)} static_parameters = ({at},), else take more "
             "particles (docs/problems.md, Parameters that never change)"
         )
-    failed = record.result is not None and not record.result.success
+    failed = record.result is not None and not (record.result.success or record.lost_values)
     if failed and not remarks and settings.particle_filter.estimate == "mean":
-        enough = _ENOUGH * settings.particle_filter.num_particles
-        beliefs = [
-            step.after.belief
-            for step in record.sensing
-            if step.observation_info.effective_sample_size >= enough
-        ]
-        several = sum(_has_modes(belief, circular) for belief in beliefs)
+        several = sum(_has_modes(step.after.belief, circular) for step in record.sensing)
         if several > _SHARE * count:
             remarks.append(
                 f"{several} of {count} beliefs had several modes, and the mean lies between them, "
@@ -103,29 +92,32 @@ def _has_modes(belief: Belief, circular: Sequence[int]) -> bool:
     return bool(kept) and heaviest_mode(own, weights, angles) is not weights
 
 
-def _depleted(record: TrialRecord) -> tuple[list[tuple[int, int, int]], list[int]]:
-    """Return the coordinates that are depleted, and those of few values that are so by chance.
+def _depleted(record: TrialRecord) -> list[tuple[int, int, int]]:
+    """Return the depleted coordinates, with the values left at the last observation, and its step.
 
-    The first ones come with the values left at the last observation, and its step. A coordinate
-    does not move if all particles have the same values after each move as before it.
+    A coordinate does not move if all particles have the same values after each move as before it.
     """
     steps = record.sensing
-    found, by_chance = [], []
+    found = []
     befores = [step.before.belief.states for step in steps]
     afters = [step.after.belief.states for step in steps]
     for at in range(befores[0].shape[1] if len(steps) > 1 else 0):
-        moves = zip(afters, befores[1:], strict=False)
-        if not all(np.array_equal(one[:, at], two[:, at]) for one, two in moves):
-            continue
         first, last = (len(np.unique(states[:, at])) for states in (befores[0], befores[-1]))
-        if 2 * first > len(befores[0]):
-            if last <= max(1.0, _FEW * first):
-                found.append((at, last, steps[-1].before.step))
-        elif first > last == 1:
-            settled = next(step for step in steps if not np.ptp(step.after.belief.states[:, at]))
-            if settled.observation_info.effective_sample_size < _FEW_EFFECTIVE:
-                by_chance.append(at)
-    return found, by_chance
+        moves = zip(afters, befores[1:], strict=False)
+        if last > max(1.0, _FEW * first) or not all(
+            np.array_equal(one[:, at], two[:, at]) for one, two in moves
+        ):
+            continue
+        varied, hidden = 2 * first > len(befores[0]), not record.true_states
+        if varied or (hidden and first > 1 and _is_by_chance(steps, at)):
+            found.append((at, last, steps[-1].before.step))
+    return found
+
+
+def _is_by_chance(steps: Sequence[SensingStep], at: int) -> bool:
+    """Return whether few effective particles were left when a coordinate's last values fell out."""
+    settled = next(step for step in steps if not np.ptp(step.after.belief.states[:, at]))
+    return settled.observation_info.effective_sample_size < _FEW_EFFECTIVE
 
 
 def _wraps(states: FloatArray, coordinate: int) -> bool:

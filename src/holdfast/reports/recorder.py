@@ -37,7 +37,7 @@ class TrialRecord:
     # Of their beliefs at most 500 particles each, with weights that are normalised.
     sensing: list[SensingStep] = field(default_factory=list)
     result: TrialResult | None = None  # None while the trial runs
-    lost_values: tuple[int, ...] = ()  # :class:`LostValues`, of a simulated world
+    lost_values: tuple[str, ...] = ()  # :class:`LostValues`, of a simulated world
 
 
 class Recorder(LostValues):
@@ -89,7 +89,7 @@ class Recorder(LostValues):
         if self._keeps(state):
             self.record.estimates.append(self._estimate(state))
             self.record.standard_deviations.append(self._deviation(state))
-        self.record.result, self.record.lost_values = result, self.coordinates
+        self.record.result, self.record.lost_values = result, self.lost
 
     def _deviation(self, state: PlanningState) -> FloatArray:
         circular = () if self._planner is None else circular_states(self._planner.problem)

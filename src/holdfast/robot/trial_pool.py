@@ -108,7 +108,7 @@ class FinishedTrial(NamedTuple):
     trial: int
     result: TrialResult
     elapsed_s: float
-    lost_values: tuple[int, ...]
+    lost_values: tuple[str, ...]
 
 
 class TrialPool:
@@ -228,7 +228,7 @@ class TrialPool:
             self._a_trial_is_long = True
             return None
         elapsed_s = perf_counter() - started
-        return self._finished(FinishedTrial(arm, trial, result, elapsed_s, observer.coordinates))
+        return self._finished(FinishedTrial(arm, trial, result, elapsed_s, observer.lost))
 
     def _finished(self, finished: FinishedTrial) -> FinishedTrial:
         for times in (self._all_times, self._times.setdefault(finished.arm, _Times())):
@@ -383,7 +383,7 @@ class _Trial(msgspec.Struct):
 class _Finished(msgspec.Struct, tag="finished"):
     result: TrialResult
     elapsed_s: float
-    lost_values: tuple[int, ...]
+    lost_values: tuple[str, ...]
 
 
 class _Built(msgspec.Struct, tag="built"):
@@ -494,7 +494,7 @@ class _Runner:
                 self._arms[request.arm] = arm = _arm_in_worker(arm, self._threads, self._problems)
                 yield _ENCODE(_Built())
             result = _run_one(arm, request.trial, observer)
-            answer = _ENCODE(_Finished(result, perf_counter() - started, observer.coordinates))
+            answer = _ENCODE(_Finished(result, perf_counter() - started, observer.lost))
         except HoldfastError as error:
             answer = _ENCODE(_Failed(str(error), True))
         except Exception:  # noqa: BLE001 - whatever it is, the parent raises it again

@@ -16,7 +16,7 @@ def run_trials(
     finished: Collection[int],
     on_result: Callable[[TrialResult], None],
     observer: LostValues | None = None,
-) -> list[tuple[int, ...]]:
+) -> list[tuple[str, ...]]:
     """Run the trials of a configuration that are not ``finished``, in at most ``jobs`` processes.
 
     ``on_result`` is called in this process with each result as soon as it is there, in any order.

@@ -24,16 +24,13 @@ SETTINGS_NAME = "tune.json"
 
 
 class TrialRow(NamedTuple):
-    """What is kept of a trial; ``decision_ms`` is the median of its sensing decisions.
-
-    ``sure_of_wrong`` is whether it has lost values (:mod:`holdfast.robot.lost_values`).
-    """
+    """What is kept of a trial; ``decision_ms`` is the median of its sensing decisions."""
 
     candidate: str
     trial: int
     success: bool
     failed: bool
-    sure_of_wrong: bool
+    lost_values: str  # names of coordinates (:class:`holdfast.robot.lost_values.LostValues`)
     steps: int
     reward: float | None
     decision_ms: float

@@ -21,7 +21,7 @@ from holdfast.planning.outcome import TRIAL_COLUMNS, TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, SimulatorSettings, check_settings
 from holdfast.printable import brief
-from holdfast.problems.attributes import coordinate_name, sensing_costs
+from holdfast.problems.attributes import sensing_costs
 from holdfast.problems.problem import Problem
 from holdfast.reports.outcome_comparison import (
     ComparedRun,
@@ -61,8 +61,8 @@ class SimulatedTrial(TrialResult, frozen=True, kw_only=True):
         priced = getattr(problem, "sensing_costs", None) is not None
         price = sum(float(costs[each.sensing_action]) for each in looks) if priced else None
         fields = {name: getattr(result, name) for name in TrialResult.__struct_fields__}
-        lost = tuple(coordinate_name(problem, at) for at in done.lost_values)
-        return cls(**{**fields, "decisions": None}, sensing_price=price, lost_values=lost)
+        fields |= {"decisions": None, "lost_values": done.lost_values}
+        return cls(**fields, sensing_price=price)
 
 
 class TrialSummary(Table):

@@ -255,9 +255,7 @@ def check_trials(inspection: Inspection) -> None:
             results.append(_simulated(inspection, planner, trial, steps, watcher))
     if results:
         _report_endings(inspection, results, steps)
-    ended = watchers[: len(results)]
-    lost = [list(map(inspection.coordinate, each.coordinates)) for each in ended]
-    if remark := remark_on_lost_values(lost):
+    if remark := remark_on_lost_values([each.lost for each in watchers[: len(results)]]):
         inspection.add("warning", "depletion", f"with random sensing, {remark}", f"{REMEDY}.")
     _report_depletion(inspection, [each for each in watchers if each.steps], remark)
     states = [step.before for watcher in watchers for step in watcher.steps]

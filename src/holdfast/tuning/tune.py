@@ -29,7 +29,7 @@ from holdfast.errors import InvalidValueError, TrialCrashError, TrialError, Work
 from holdfast.journal.fingerprint import fingerprint
 from holdfast.numerics.arrays import FloatArray, real_number, whole
 from holdfast.printable import brief
-from holdfast.robot.lost_values import are_many
+from holdfast.robot.lost_values import remark_on_lost_values
 from holdfast.robot.trial_pool import Arm, TrialPool
 from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.files import shown_path
@@ -133,9 +133,8 @@ def tune(
         configuration = load(as_path("configuration", configuration))
     for each in vary if isinstance(vary, list | tuple) else [vary]:
         if not isinstance(each, str) or each not in VARIATIONS:
-            allowed = ", ".join(VARIATIONS)
-            hint = close_match(str(each), VARIATIONS)
-            raise InvalidValueError(f"vary has {brief(each)}; allowed are {allowed}{hint}")
+            allowed = ", ".join(VARIATIONS) + close_match(str(each), VARIATIONS)
+            raise InvalidValueError(f"vary has {brief(each)}; allowed are {allowed}")
     as_function("on_progress", on_progress)
     most = whole("most", most, 2, FRESH - 1)
     jobs = None if jobs is None else whole("jobs", jobs, 1, MAX_JOBS)
@@ -240,7 +239,14 @@ class _Tuner:
         verdict = judge(
             rows, finalists, self.objective, self._limit, barred, min(most, _LEAST_FRESH)
         )
-        sentence = verdict.sentence + self._note_on_lost_values(rows[verdict.choice])
+        sentence = verdict.sentence
+        chosen = (row.lost_values for row in rows[verdict.choice])
+        if lost := remark_on_lost_values([each.split("; ") if each else [] for each in chosen]):
+            particles = 10 * self.base.planning.particle_filter.num_particles
+            sentence += (
+                f" But {lost}. More particles may gain more than any method: holdfast tune "
+                f"{shown_path(self.base.path)} --set particle_filter.num_particles={particles}."
+            )
         left_out |= self._failed
         for name, reason in list(left_out.items())[:_MOST_REFUSED]:
             sentence += f" {name} was left out: {reason.splitlines()[0]}."
@@ -265,18 +271,6 @@ class _Tuner:
             fresh_trials=fresh,
             comparisons=verdict.comparisons,
             candidates=tuple(map(self._row, standings)),
-        )
-
-    def _note_on_lost_values(self, rows: Sequence[TrialRow]) -> str:
-        if not are_many(lost := sum(row.sure_of_wrong for row in rows), len(rows)):
-            return ""
-        more = 10 * self.base.planning.particle_filter.num_particles
-        command = (
-            f"holdfast tune {shown_path(self.base.path)} --set particle_filter.num_particles={more}"
-        )
-        return (
-            f" But {lost} of its {len(rows)} trials ended sure of a wrong value: particles are too "
-            f"few, and more may gain more than any method: {command}."
         )
 
     def _spent_s(self) -> float:
@@ -404,7 +398,7 @@ class _Tuner:
                         finished.trial,
                         result.success,
                         result.failed,
-                        bool(finished.lost_values),
+                        "; ".join(finished.lost_values),
                         result.steps,
                         result.reward,
                         float(np.median(result.sensing_ms)) if result.sensing_ms else 0.0,
