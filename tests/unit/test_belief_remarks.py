@@ -60,34 +60,31 @@ def bits_of(variances: tuple[float, float], *, hidden: bool) -> list[str]:
     """Return the remarks on twelve trials with a bit, of a robot whose world is ``hidden``."""
     problem, found = Bit(), []
     problem.variances = variances
+    planner = Planner(problem, RANDOM)
     for trial in range(12):
-        recorder = Recorder(trial, planner := Planner(problem, RANDOM))
+        recorder = Recorder(trial, planner)
         run_trial(planner, 3, trial, max_steps=20, observer=recorder)
         if hidden:
             recorder.record.true_states.clear()
-        (*remarks,) = belief_remarks(problem, RANDOM, recorder.record)
-        assert hidden or bool(remarks) == bool(recorder.coordinates)
-        assert not belief_remarks(problem, RANDOM, recorder.record, lost_are_told=True) or hidden
-        found.append(" ".join(remarks))
+            recorder.record.lost_values = ()
+        found.append(" ".join(belief_remarks(problem, RANDOM, recorder.record)))
+        assert hidden or bool(found[-1]) == bool(recorder.lost)
+        assert hidden or not belief_remarks(problem, RANDOM, recorder.record, lost_are_told=True)
     return found
 
 
-class TestBits:
-    """Certainty by chance and by evidence, where the truth is known and where it is not."""
-
-    def test_by_chance(self) -> None:
-        says = "{} value of bit at the end. Resampling loses such a value by chance"
-        known, unknown = (bits_of((1e-8, 4.0), hidden=hidden) for hidden in (False, True))
-        found = [each for each in known if each]
-        assert 1 < len(found) < 12
-        assert all(each.startswith(says.format("no particle had the true")) for each in found)
-        found = [each for each in unknown if each]
-        assert len(found) > 8
-        assert all(each.startswith(says.format("chance left one")) for each in found)
-
-    def test_by_evidence(self) -> None:
-        for hidden in (False, True):
-            assert not any(bits_of((4.0, 1e-4), hidden=hidden))
+@pytest.mark.parametrize(
+    ("hidden", "least", "says"),
+    [
+        (False, 2, "no particle had the true value of bit at the end. Resampling loses such"),
+        (True, 9, "bit does not move, and by step 20 its particles had 1 different values left"),
+    ],
+)
+def test_a_bit_is_certain_by_chance_or_by_evidence(hidden: bool, least: int, says: str) -> None:
+    told = [each for each in bits_of((1e-8, 4.0), hidden=hidden) if each]
+    assert least <= len(told) < 13
+    assert all(each.startswith(says[:20]) for each in told)
+    assert not any(bits_of((4.0, 1e-4), hidden=hidden))
 
 
 class TestAngles:

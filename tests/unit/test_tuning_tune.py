@@ -53,7 +53,7 @@ def test_what_it_finds_and_writes(run: Path) -> None:
     result = hf.run_trial(
         hf.Planner(load(run).problem, load(run).planning), seed=3, trial=0, max_steps=25
     )
-    assert rows[1].startswith(f"as configured,0,{int(result.success)},0,0,{result.steps},")
+    assert rows[1].startswith(f"as configured,0,{int(result.success)},0,,{result.steps},")
 
 
 def test_candidates_that_die_hang_or_fail_leave_the_race(
@@ -97,9 +97,8 @@ def test_it_says_that_particles_are_too_few(run: Path) -> None:
     (run.parent / "bits.py").write_text("from tests.unit.test_lost_values import Bit\n")
     run.write_text(RUN.replace("peg_in_hole_2d", "bits:Bit"))
     found = tuned(run, vary=["fixed"], most=20)
-    assert found.choice in (AS_CONFIGURED, RANDOM, "always first")
     more = f"tune {run} --set particle_filter.num_particles=300."
-    assert re.search(rf" But \d+ of its \d+ trials ended sure of a wrong .* {more}", found.sentence)
+    assert re.search(rf" But \d+ of 40 trials ended sure of a wrong .* {more}", found.sentence)
 
 
 OF_MEAN = RUN.replace("peg_in_hole_2d", "mean:Mean") + "selector: {method: fixed}\n"

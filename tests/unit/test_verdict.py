@@ -29,7 +29,7 @@ def rows(
             n,
             n not in failures,
             False,
-            False,
+            "",
             round(steps + more + noise[n]),
             reward,
             decision_ms,
