@@ -115,10 +115,7 @@ def begin_after(
         world.environment.perform(action)
     world.carry_out(
         world.robot.begin_trial(
-            history,
-            EnvironmentReady(None, steps_performed),
-            0.0,
-            tail_is_certain=tail_is_certain,
+            history, EnvironmentReady(None, steps_performed), 0.0, tail_is_certain=tail_is_certain
         )
     )
     return world
