@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from tests.line_problem import SETTINGS, Line
+from tests.line_problem import SETTINGS, Beacon, Line
 
 import holdfast as hf
 from holdfast.numerics.arrays import FloatArray
@@ -17,8 +17,8 @@ TRIALS = 30
 RANDOM = msgspec.structs.replace(SETTINGS, selector=SelectorSettings(method="random"))
 
 
-class Bit(Line):
-    """A robot that also looks for a bit, with a dull sensor; its other one leaves few particles."""
+class Bit(Beacon):
+    """A robot that looks for a bit, with a dull sensor; its other one leaves few particles."""
 
     state_labels: Any = ("robot (m)", "bit")
     variances: Any = (1e-8, 4.0)
@@ -27,16 +27,8 @@ class Bit(Line):
         bits = stream.substream(0).integers(0, 2, size=(count, 1))
         return np.concatenate([stream.substream(1).normal((count, 1)), bits], axis=1)
 
-    def move(self, states: FloatArray, actions: FloatArray, stream: Any) -> FloatArray:
-        moved = states.copy()
-        moved[..., :1] += actions + 0.1 * stream.normal(states[..., :1].shape)
-        return moved
-
     def observation_variance(self, states: FloatArray, sensing_action: int) -> FloatArray:
         return np.array([self.variances[sensing_action]])
-
-    def is_goal(self, states: FloatArray) -> Any:
-        return np.zeros(states.shape[:-1], dtype=bool)
 
 
 class Ended(LostValues):
@@ -66,10 +58,6 @@ def test_a_bit_that_chance_has_decided() -> None:
 def test_right_certainty_and_what_has_no_few_values_do_not_count() -> None:
     class Exact(Bit):
         variances = (4.0, 1e-4)
-
-    class Beacon(Bit):
-        def initial_states(self, stream: Any, count: int) -> FloatArray:
-            return Line.initial_states(self, stream, count)
 
     class FewAtFirst(Bit):
         move = Line.move
