@@ -63,6 +63,6 @@ def remark_on_lost_values(trials: Sequence[Sequence[str]]) -> str:
     count = sum(map(bool, trials))
     if count <= max(1.0, 0.05 * len(trials)):
         return ""
-    names = ", ".join(dict.fromkeys(name for lost in trials for name in lost))
+    names = ", ".join(sorted({name for lost in trials for name in lost}))
     ended = f"{count} of {len(trials)} trials ended sure of a wrong value"
     return f"{ended}: no particle had the true one of {names}"

@@ -117,8 +117,8 @@ def _report_angles(inspection: Inspection, jumps: IntArray, turns: IntArray) -> 
         for at in np.flatnonzero((counts[1] >= 2) & (counts[1] == counts[0])).tolist():
             seen = f"coordinate {at} of {whose} jumps by a whole turn (2 pi) in one step, and is "
             seen += "not declared to be an angle: the mean of 3.1 and -3.1 is taken for 0"
-            advice = f"Give the problem {attribute} = ({at},), and circular_observations if it "
-            advice += "is sensed; in a policy take numerics.wrapped(goal - heading)."
+            advice = f"Give the problem {attribute} = ({at},), and circular_observations to a "
+            advice += "Gaussian sensor; elsewhere take numerics.wrapped(goal - heading)."
             if at not in declared:
                 inspection.add("warning", "units", seen, advice)
 
