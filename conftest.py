@@ -165,7 +165,7 @@ COROUTINE_BOUND_S = 120.0
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     """Run a test that is a coroutine on a loop of its own.
 
-    What a fixture gives it is closed on that loop, too, if it has a coroutine ``close_on_loop``.
+    What its fixtures give is closed on that loop, too, if it has a coroutine ``close_on_loop``.
     """
     test: Any = pyfuncitem.obj
     if not inspect.iscoroutinefunction(test):
@@ -176,7 +176,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
         try:
             await test(**arguments)
         finally:
-            for argument in arguments.values():
+            for argument in pyfuncitem.funcargs.values():
                 if hasattr(argument, "close_on_loop"):
                     await argument.close_on_loop()
 

@@ -38,3 +38,21 @@ class Line(ProblemBase):
 
     def is_goal(self, states: FloatArray) -> Any:
         return np.abs(states[..., 0]) < 0.1
+
+
+class Beacon(Line):
+    """A robot on a line that looks for a beacon, which does not move."""
+
+    state_labels: Any = ("robot (m)", "beacon (m)")
+    noise = np.array([0.1, 0.0])
+
+    def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
+        moved = states + self.noise * stream.normal(states.shape)
+        moved[..., :1] += actions
+        return moved
+
+    def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
+        return np.clip(states[..., 1:] - states[..., :1], -0.1, 0.1)
+
+    def is_goal(self, states: FloatArray) -> Any:
+        return np.zeros(states.shape[:-1], dtype=bool)

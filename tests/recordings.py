@@ -41,6 +41,15 @@ def result_of(
     )
 
 
+class Steps(TrialObserver):
+    """Keeps what the loop of a trial shows."""
+
+    def __init__(self) -> None:
+        self.sensing: list[SensingStep] = []
+        self.tasks: list[TaskStep] = []
+        vars(self).update(sensed=self.sensing.append, acted=self.tasks.append)
+
+
 def configuration_of(
     tmp_path: Path,
     *,

@@ -76,15 +76,20 @@ class TestReplicas:
     def replicas(self, wire: StreamWire, monkeypatch: pytest.MonkeyPatch) -> Replicas:
         return Replicas(wire, 3, monkeypatch)
 
-    async def test_one_that_is_about_to_end_is_left_before_it_is_missed(
-        self, wire: StreamWire, replicas: Replicas
-    ) -> None:
+    async def begun(
+        self, wire: StreamWire, replicas: Replicas, count: int = 3
+    ) -> tuple[Received, Any, Inbox, str]:
         calls = Received()
-        for host in replicas.hosts:
+        for host in replicas.hosts[:count]:
             await replicas.start(host, calls)
         robot, inbox = wire.robot("cloud"), Inbox()
         robot.start(inbox)
-        first = await inbox.appeared()
+        return calls, robot, inbox, await inbox.appeared()
+
+    async def test_one_that_is_about_to_end_is_left_before_it_is_missed(
+        self, wire: StreamWire, replicas: Replicas
+    ) -> None:
+        calls, robot, inbox, first = await self.begun(wire, replicas)
         robot.call("cloud", 1, b"owed")
         owed = await calls.next()
         gone = replicas.running[first].dismiss()
@@ -111,12 +116,7 @@ class TestReplicas:
     async def test_a_question_asked_while_another_is_owed_goes_to_the_next(
         self, wire: StreamWire, replicas: Replicas
     ) -> None:
-        calls = Received()
-        for host in replicas.hosts[:2]:
-            await replicas.start(host, calls)
-        robot, inbox = wire.robot("cloud"), Inbox()
-        robot.start(inbox)
-        first = await inbox.appeared()
+        calls, robot, inbox, first = await self.begun(wire, replicas, 2)
         robot.call("cloud", 1, b"given up")
         await calls.next()
         replicas.running[first].dismiss()
@@ -150,12 +150,7 @@ class TestReplicas:
         await wire.close_on_loop()
 
     async def test_the_next_one_is_lost_too(self, wire: StreamWire, replicas: Replicas) -> None:
-        calls = Received()
-        for host in replicas.hosts:
-            await replicas.start(host, calls)
-        robot, inbox = wire.robot("cloud"), Inbox()
-        robot.start(inbox)
-        first = await inbox.appeared()
+        calls, robot, inbox, first = await self.begun(wire, replicas)
         robot.call("cloud", 1, b"owed")
         owed = await calls.next()
         replicas.running[first].dismiss()

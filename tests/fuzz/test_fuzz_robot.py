@@ -10,6 +10,7 @@ import random
 from collections.abc import Callable
 
 import msgspec
+import pytest
 from hypothesis import strategies as st
 from tests.fuzz import corpus
 from tests.fuzz.examples import always, examples
@@ -149,10 +150,11 @@ class HostileWorld(World):
         ]
 
 
+@pytest.mark.parametrize("how", [(), ("beyond",)], ids=["anything", "beyond the limits"])
 @examples(quick=15, slow=800)
-def test_whatever_comes_the_decisions_are_the_same(examples: int) -> None:
+def test_whatever_comes_the_decisions_are_the_same(examples: int, how: tuple[str, ...]) -> None:
     def check(seed: int) -> None:
-        world = HostileWorld(seed, share=0.7)
+        world = HostileWorld(seed, 0.7, *how)
         world.start()
         world.run(until_s=600.0)
         assert world.stopped is None, world.stopped
@@ -161,18 +163,6 @@ def test_whatever_comes_the_decisions_are_the_same(examples: int) -> None:
         assert isinstance(dispatcher, Dispatcher)
         calls = dispatcher._calls._open
         assert len(calls) <= 4 * len(world.services)
-
-    always(examples, check, st.integers(0, 2**48))
-
-
-@examples(quick=15, slow=800)
-def test_no_action_beyond_the_limits_is_performed(examples: int) -> None:
-    def check(seed: int) -> None:
-        world = HostileWorld(seed, 0.7, "beyond")
-        world.start()
-        world.run(until_s=600.0)
-        assert world.stopped is None, world.stopped
-        world.assert_same_as_without_faults()
 
     always(examples, check, st.integers(0, 2**48))
 

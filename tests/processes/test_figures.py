@@ -6,14 +6,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.processes.test_streams import CONFIGURATION
 from tests.programs import completed
-
-CONFIGURATION = """
-problem: capsule_robot
-particle_filter: {num_particles: 20}
-active_sensing: {num_observation_samples: 2, num_cores: 1}
-simulator: {num_trials: 1, max_steps: 20, seed: 3}
-"""
 
 
 def run(directory: Path, **environment: str) -> subprocess.CompletedProcess[str]:

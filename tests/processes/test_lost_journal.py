@@ -168,10 +168,12 @@ class TestCutOffAfterAKill:
 class TestCannotBeWritten:
     @needs_mounts
     @pytest.mark.parametrize(
-        "killed", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["killed", "ended"]
+        ("killed", "alone"),
+        [(True, False), pytest.param(False, False, marks=pytest.mark.slow), (True, True)],
+        ids=["killed", "ended", "the journal alone"],
     )
     def test_a_read_only_file_system(
-        self, killed: bool, site: Site, references: References
+        self, killed: bool, alone: bool, site: Site, references: References
     ) -> None:
         story = Story(site, references, SHORT)
         end = site.kill_robot if killed else lambda: story.running.signal(signal.SIGTERM)
@@ -179,27 +181,11 @@ class TestCannotBeWritten:
         robot = site.run(story.file)
         assert robot.wait() in (-signal.SIGKILL, 128 + signal.SIGTERM)
         before = content(robot.out)
-        command = in_namespace(READ_ONLY, robot.out)
+        read_only = journal_of(robot) if alone else robot.out
+        command = in_namespace(READ_ONLY, read_only)
         again = site.run(story.file, resume=True, command=command)
         assert again.wait() == 2, again.account()
-        assert f"{robot.out}: cannot be written: Read-only file system" in again.output
-        assert "its journal is whole" in again.output
-        assert content(robot.out) == before
-        story.finish(site.run(story.file, resume=True))
-
-    @needs_mounts
-    def test_a_read_only_journal(self, site: Site, references: References) -> None:
-        """The directory may be written, the file alone may not."""
-        story = Story(site, references, SHORT)
-        story.at("sense", KILLED, site.kill_robot)
-        robot = site.run(story.file)
-        assert robot.wait() == -signal.SIGKILL
-        before = content(robot.out)
-        again = site.run(
-            story.file, resume=True, command=in_namespace(READ_ONLY, journal_of(robot))
-        )
-        assert again.wait() == 2, again.account()
-        assert f"{journal_of(robot)}: cannot be written: Read-only file system" in again.output
+        assert f"{read_only}: cannot be written: Read-only file system" in again.output
         assert "its journal is whole" in again.output
         assert content(robot.out) == before
         story.finish(site.run(story.file, resume=True))

@@ -10,19 +10,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
+from tests.command_line import PEG
 from tests.ports import free_port
 from tests.processes.faults import COMMAND, holdfast, rows_of, summary_of, wait_until
 
 from holdfast.config.source_digest import core_version, machines
 
 WITH_FIGURES = [sys.executable, "-c", "from holdfast.cli import main; main()"]
-
-PEG = """
-problem: peg_in_hole_2d
-particle_filter: {num_particles: 40}
-active_sensing: {num_observation_samples: 3, num_cores: 1}
-simulator: {num_trials: 6, max_steps: 80, seed: 3}
-"""
 
 # Notes the process and the time of each trial's start. All but the first trials of the workers wait
 # for leave, so that the run is still going on whatever a test does meanwhile; those of the command

@@ -7,12 +7,11 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from tests.line_problem import SETTINGS, Line
+from tests.line_problem import SETTINGS, Beacon
 from tests.recordings import record_trial
+from tests.unit.test_lost_values import RANDOM, Bit
 
 from holdfast.config.loader import Configuration, load
-from holdfast.numerics.arrays import FloatArray, IntArray
-from holdfast.numerics.randomness import Stream
 from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner
 from holdfast.reports.belief_remarks import belief_remarks
@@ -51,6 +50,36 @@ class TestSeveralModes:
         assert "particle_filter.estimate: heaviest_mode" in remark
         assert not remarks_of("corridor_anywhere", trial)
 
+    def test_the_mean_of_zeros_and_ones_is_a_probability(self) -> None:
+        assert not any(bits_of((4.0, 1e6), hidden=False))
+
+
+def bits_of(variances: tuple[float, float], *, hidden: bool) -> list[str]:
+    """Return the remarks on twelve trials with a bit, of a robot whose world is ``hidden``."""
+    problem, found = Bit(), []
+    problem.variances = variances
+    planner = Planner(problem, RANDOM)
+    for trial in range(12):
+        recorder = Recorder(trial, planner)
+        run_trial(planner, 3, trial, max_steps=20, observer=recorder)
+        if hidden:
+            recorder.record.true_states.clear()
+            recorder.record.lost_values = ()
+        found.append(" ".join(belief_remarks(problem, RANDOM, recorder.record)))
+        assert hidden or bool(found[-1]) == bool(recorder.lost)
+        assert hidden or not belief_remarks(problem, RANDOM, recorder.record, lost_are_told=True)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("hidden", "least", "says"),
+    [(False, 2, "no particle had the true value of bit"), (True, 9, "bit does not move, and by")],
+)
+def test_a_bit_is_certain_by_chance_or_by_evidence(hidden: bool, least: int, says: str) -> None:
+    told = [each.startswith(says) for each in bits_of((1e-8, 4.0), hidden=hidden) if each]
+    assert least <= len(told) == sum(told)
+    assert not any(bits_of((4.0, 1e-4), hidden=hidden))
+
 
 class TestAngles:
     def test_a_heading_that_is_averaged_as_a_number_is_told(self) -> None:
@@ -64,24 +93,6 @@ class TestAngles:
         assert remark.startswith("heading (rad) lay on both sides of a whole turn in ")
         assert "give wrapping_heading circular = (2,)" in remark
         assert not remarks_on(configuration, configuration.problem, 0)
-
-
-class Beacon(Line):
-    """A robot on a line that looks for a beacon, which does not move."""
-
-    state_labels = ("robot (m)", "beacon (m)")
-    noise = np.array([0.1, 0.0])
-
-    def move(self, states: FloatArray, actions: FloatArray, stream: Stream) -> FloatArray:
-        moved = states + self.noise * stream.normal(states.shape)
-        moved[..., :1] += actions
-        return moved
-
-    def policy(self, states: FloatArray, stage: int | IntArray) -> FloatArray:
-        return np.clip(states[..., 1:] - states[..., :1], -0.1, 0.1)
-
-    def is_goal(self, states: FloatArray) -> Any:
-        return np.zeros(states.shape[:-1], dtype=bool)
 
 
 class TestDepletion:
@@ -102,7 +113,7 @@ class TestDepletion:
     def test_what_does_not_move_is_told(self) -> None:
         (remark,), result, _ = self.recorded(Beacon())
         assert remark.startswith("beacon (m) does not move, and by step 58 its particles had 1 ")
-        assert "docs/problems.md, What does not move" in remark
+        assert "docs/problems.md, Parameters that never change" in remark
         # The robot's own coordinate is another one in each particle.
         assert result.fewest_distinct_particles == 30
 
@@ -111,14 +122,6 @@ class TestDepletion:
             noise = np.array([0.1, 0.03])
 
         remarks, _, _ = self.recorded(Drifting())
-        assert not remarks
-
-    def test_nor_of_a_switch(self) -> None:
-        class Switch(Beacon):
-            def initial_states(self, stream: Stream, count: int) -> FloatArray:
-                return np.sign(stream.normal((count, 2)))
-
-        remarks, _, _ = self.recorded(Switch())
         assert not remarks
 
     def test_info_and_result_count_what_is_left(self) -> None:

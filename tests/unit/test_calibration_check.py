@@ -56,8 +56,11 @@ def test_remedies() -> None:
     shown = states[np.arange(200), truths] + 0.3 * generator.normal(size=200)
     right = -0.5 * ((shown[:, np.newaxis] - states) / 0.3) ** 2
     assert remedy_of(right, truths) is None
+    three = np.arange(100) % 3
+    named = np.where(generator.random(200) < 0.5, truths % 3, generator.integers(3, size=200))
     for wrong, words in (
         (np.exp(right), "logarithm"),
+        (np.where(named[:, np.newaxis] == three, 2 / 3, 1 / 6), "logarithm"),
         (-right, "other sign"),
         (right * 9.0, "times as wide"),
         (right / 9.0, "times as wide"),

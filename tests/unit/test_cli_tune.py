@@ -62,8 +62,9 @@ def test_after_a_killed_worker_it_can_go_on(
     [
         (("--budget", "10"), "--budget is '10'; allowed are durations from 1s to 720h"),
         (
-            ("--vary", "looks,method"),
-            "--vary is 'looks,method'; allowed are lists of methods, looks",
+            ("--vary", "looks,methd"),
+            "--vary is 'methd'; allowed are methods, looks, resolution, estimators, fixed, "
+            "interval, particles, with commas between; did you mean methods?",
         ),
         (("--resume",), "--resume needs --out DIR"),
         (("--objective", "step"), "--objective is 'step'; allowed are reward, steps and success"),

@@ -4,7 +4,7 @@ import os
 
 import pytest
 from prometheus_client.core import GaugeMetricFamily
-from prometheus_client.parser import text_string_to_metric_families
+from tests.unit.test_service_metrics import samples_of
 
 from holdfast.runtime.exposition import BUCKETS_S, Durations, exposition
 
@@ -22,10 +22,6 @@ def test_a_bucket_has_its_upper_end_and_all_below() -> None:
 
 def test_the_process_is_told_beside_the_metrics() -> None:
     text = exposition([GaugeMetricFamily("own", "Mine.", 3)], (os.getpid(),)).decode()
-    values = {
-        sample.name: sample.value
-        for family in text_string_to_metric_families(text)
-        for sample in family.samples
-    }
+    values = {name: value for (name, _), value in samples_of(text).items()}
     assert values["own"] == 3
     assert values["process_cpu_seconds_total"] > 0

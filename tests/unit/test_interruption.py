@@ -145,30 +145,24 @@ def test_one_that_is_set_before_its_time_is_over_was_not_too_long() -> None:
     assert not interruption.took_too_long
 
 
-def test_few_particles_among_many_obstacles_leave_the_interpreter() -> None:
-    """Nothing of it would end while another thread could not set the interruption."""
-    ahead = {"end_0": [-1000.0, -9.0], "end_1": [-1000.0, 9.0]}
-    elsewhere = {"end_0": [100.0, 100.0], "end_1": [100.0, 101.0]}
-    problem = CapsuleRobot.from_settings({"walls": [elsewhere] * 9000 + [ahead]}, {})
-    states = np.tile([-1001.0, 0.0], (1000, 1))
-    interruption = Interruption()
-    other = threading.Timer(0.02, interruption.set)
-    other.start()
-    with pytest.raises(InterruptedComputationError), interruptible(interruption):
-        problem.move(states, np.array([1.0, 0.0]), stream(0, 0, 0, Purpose.PREDICTION))
-    other.join()
+@pytest.mark.parametrize("placed", ["before a wall", "in a wall"])
+def test_few_particles_among_many_obstacles_leave_the_interpreter(placed: str) -> None:
+    """Nothing of it would end while another thread could not set the interruption.
 
-
-def test_one_block_of_particles_in_an_obstacle_leaves_the_interpreter_and_ends() -> None:
-    """With so many walls, each of a thousand attempts to place the noise takes long."""
-    around = {"end_0": [-1000.0, 0.0], "end_1": [-1000.0, 3.0], "thickness": 500.0}
+    In a wall, each of a thousand attempts to place the noise of one block of particles takes long.
+    """
     elsewhere = {"end_0": [100.0, 100.0], "end_1": [100.0, 101.0]}
-    model = {"walls": [elsewhere] * 3000 + [around], "motion_cov": [1e-12, 1e-12]}
+    wall: Any = {"end_0": [-1000.0, -9.0], "end_1": [-1000.0, 9.0]}
+    model: Any = {"walls": [elsewhere] * 9000 + [wall]}
+    states, action = np.tile([-1001.0, 0.0], (1000, 1)), np.array([1.0, 0.0])
+    if placed == "in a wall":
+        wall = {"end_0": [-1000.0, 0.0], "end_1": [-1000.0, 3.0], "thickness": 500.0}
+        model = {"walls": [elsewhere] * 3000 + [wall], "motion_cov": [1e-12, 1e-12]}
+        states, action = np.tile([-1000.0, 1.0], (128, 1)), np.zeros(2)
     problem = CapsuleRobot.from_settings(model, {})
-    states = np.tile([-1000.0, 1.0], (128, 1))
     interruption = Interruption()
     other = threading.Timer(0.02, interruption.set)
     other.start()
     with pytest.raises(InterruptedComputationError), interruptible(interruption):
-        problem.move(states, np.zeros(2), stream(0, 0, 0, Purpose.PREDICTION))
+        problem.move(states, action, stream(0, 0, 0, Purpose.PREDICTION))
     other.join()

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.recordings import Journalling, configuration_of
+from tests.recordings import Journalling, Steps, configuration_of
 from tests.trial_inputs import come_late, sense
 
 from holdfast.config.loader import Configuration
@@ -28,7 +28,7 @@ from holdfast.reports.facts import (
 )
 from holdfast.reports.live_follower import Follower, RunFiles
 from holdfast.robot.environment import SimulatedEnvironment
-from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
+from holdfast.robot.trial import run_trial
 
 SECOND = 1_000_000_000
 
@@ -43,18 +43,6 @@ class Facts:
 
     def of(self, kind: type) -> list[Any]:
         return [fact for fact in self.all if isinstance(fact, kind)]
-
-
-class Steps(TrialObserver):
-    def __init__(self) -> None:
-        self.sensing: list[SensingStep] = []
-        self.acting: list[TaskStep] = []
-
-    def sensed(self, step: SensingStep) -> None:
-        self.sensing.append(step)
-
-    def acted(self, step: TaskStep) -> None:
-        self.acting.append(step)
 
 
 def a_trial(configuration: Configuration, number: int) -> tuple[list[Record], Trial]:
@@ -98,7 +86,7 @@ def test_the_same_facts_as_of_the_trial_itself(configuration: Configuration) -> 
         assert digest(shown.after) == digest(step.after)
         assert shown.observation_info == step.observation_info
     world = SimulatedEnvironment(configuration.problem, configuration.simulator.seed, 1)
-    for fact, acted in zip(facts.of(TaskFact), expected.acting, strict=True):
+    for fact, acted in zip(facts.of(TaskFact), expected.tasks, strict=True):
         assert fact.step.executed.tobytes() == acted.executed.tobytes()
         assert digest(fact.step.state) == digest(acted.state)
         assert fact.step.task_info.estimate.tolist() == acted.task_info.estimate.tolist()

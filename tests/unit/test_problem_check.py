@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.unit.test_lost_values import Bit
 
 import holdfast as hf
 from holdfast import numerics
@@ -209,6 +210,7 @@ GridStart(Rover).initial_states:
 NotFinite(Rover).move:
     np.where((moved := Rover.move(self, states, actions, stream)) < 1.0, np.nan, moved)
 OneStateOnly(Rover).policy: np.array([-states[0], -states[1]])
+OneNumber(Rover).sample_observation: state[sensing_action] + self.deviation * stream.normal()
 Branches(Rover).policy: -states if states[0] > 0.0 else 0.0 * states
 MeanOfTheBelief(Rover).policy: -states + 0.1 * states.reshape(-1, 2).mean(axis=0)
 OneGoalForAll(Rover).is_goal: (np.abs(states) < 0.2).all()
@@ -267,6 +269,7 @@ WRONG = {
     "Counts": (E, "purity", "policy returned something else"),
     "ChangesItsArgument": (E, "contract", "limit_action raised ValueError: .*read-only"),
     "OneStateOnly": (E, "contract", r"policy of rover returned .* of shape \(2, 2\)"),
+    "OneNumber": (E, "contract", r"sample_observation of .* need a float64 array of shape \(n,\)"),
     "Branches": (E, "contract", "policy raised ValueError: The truth value"),
     "MeanOfTheBelief": (E, "contract", "policy of a belief is .* in another leading shape"),
     "OneGoalForAll": (E, "contract", "is_goal of rover returned"),
@@ -314,6 +317,9 @@ def test_what_is_wrong_is_named(kind: str) -> None:
     assert named, found
     assert named[0].severity == severity
     assert named[0].advice
+    assert ("np.array([value])" in named[0].advice) == (kind == "OneNumber")
+    blamed = re.findall(r"\b(\w+) of rover returned", " ".join(each.seen for each in found))
+    assert len(set(blamed)) == len(blamed)
     if severity == E:
         assert found[0].severity == E
         if "raised" in named[0].seen:
@@ -336,6 +342,13 @@ def test_static_parameters_are_advised_where_none_are_declared(declared: tuple[i
     problem.static_parameters = declared
     (advice,) = [each.advice for each in check(problem) if "lies beyond all" in each.seen]
     assert ("static_parameters" in advice) == (not declared)
+
+
+def test_of_a_bit_it_says_how_many_trials_end_wrong() -> None:
+    found = [each for each in check(Bit()) if each.check == "depletion"]
+    assert re.search(r"[2-8] of 8 trials ended sure of a wrong .* true one of bit", found[0].seen)
+    assert "resampling_threshold: 0.5" in found[0].advice
+    assert not [each for each in found if "static_parameters" in each.advice]
 
 
 RIGHT = [

@@ -193,6 +193,9 @@ class TestMisspelt:
             ("sensing_cost", "sensing_costs"),
             ("circular_observation", "circular_observations"),
             ("rewards", "reward"),
+            ("is_failed", "is_failure"),
+            ("knownStateReturn", "known_state_return"),
+            *((f"{name}_", name) for name in PARAMETERS if not hasattr(Line, name)),
         ],
     )
     def test_one_that_would_be_ignored(self, name: str, meant: str) -> None:
@@ -206,7 +209,9 @@ class TestMisspelt:
     def test_names_that_mean_nothing_else(self) -> None:
         """A helper beside the function itself, and one of no known name."""
         check_problem(
-            self.of(rewards=1, reward=Line.policy, my_helper=1, speed=2, _log_likelyhood=3)
+            self.of(
+                rewards=1, reward=Line.policy, my_helper=1, observation_size=2, _log_likelyhood=3
+            )
         )
 
     def test_one_of_a_pair(self) -> None:

@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -115,10 +116,7 @@ def begin_after(
         world.environment.perform(action)
     world.carry_out(
         world.robot.begin_trial(
-            history,
-            EnvironmentReady(None, steps_performed),
-            0.0,
-            tail_is_certain=tail_is_certain,
+            history, EnvironmentReady(None, steps_performed), 0.0, tail_is_certain=tail_is_certain
         )
     )
     return world
@@ -435,19 +433,21 @@ def test_a_robot_that_takes_its_task_actions_itself_waits_at_sensing_steps_alone
 # -- found in review -------------------------------------------------------------------------------
 
 
-def test_an_answer_for_another_step_than_was_asked_of_the_environment_stops_the_robot() -> None:
-    world = World()
+def why_stopped(world: World, spoilt: Callable[[Any], Sensed | NoReading | Acted]) -> str:
+    """Return why a robot stops whose environment's answers are spoilt."""
     later = world.later
-
-    def spoil(event: Sensed | NoReading | Acted) -> Callable[[], list[RobotEffect]]:
-        if isinstance(event, Acted) and event.step == 6:
-            event = event._replace(moved=Moved(5, None))
-        return later(event)
-
-    world.later = spoil  # type: ignore[method-assign]
+    world.later = lambda event: later(spoilt(event))  # type: ignore[method-assign]
     world.start_and_run()
     assert world.stopped is not None
-    assert "step 5 where step 6" in str(world.stopped.error)
+    return str(world.stopped.error)
+
+
+def test_an_answer_for_another_step_than_was_asked_of_the_environment_stops_the_robot() -> None:
+    def spoilt(event: Any) -> Any:
+        wrong = isinstance(event, Acted) and event.step == 6
+        return event._replace(moved=Moved(5, None)) if wrong else event
+
+    assert "step 5 where step 6" in why_stopped(World(), spoilt)
 
 
 def test_a_performance_is_written_down_before_the_robot_waits_for_anything() -> None:
@@ -470,17 +470,11 @@ def test_a_performance_is_written_down_before_the_robot_waits_for_anything() -> 
 
 
 def test_an_observation_of_the_wrong_size_stops_the_robot_resumably() -> None:
-    world = World(launch="never")
-    later = world.later
+    def spoilt(event: Any) -> Any:
+        wrong = isinstance(event, Sensed) and event.step >= 4
+        return msgspec.structs.replace(event, observation=bytes(56)) if wrong else event
 
-    def spoil(event: Sensed | NoReading | Acted) -> Callable[[], list[RobotEffect]]:
-        if isinstance(event, Sensed) and event.step >= 4:
-            event = msgspec.structs.replace(event, observation=bytes(56))
-        return later(event)
-
-    world.later = spoil  # type: ignore[method-assign]
-    world.start_and_run()
-    assert world.stopped is not None
+    why_stopped(world := World(launch="never"), spoilt)
     history = replay(Planner(PROBLEM, PLANNING), 11, 0, world.journal)
     assert history.pending is None
     assert history.state.step == 4

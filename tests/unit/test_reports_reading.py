@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.command_line import Workplace
-from tests.recordings import decided, forget_steps, rewrite
+from tests.recordings import Steps, decided, forget_steps, rewrite
 
 import holdfast as hf
 from holdfast.errors import OutputError
 from holdfast.reports.reading import RunArrays
-from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver
 
 Recorded = Callable[..., RunArrays]
 
@@ -39,20 +38,6 @@ class Robot:
 """
 
 
-class Seen(TrialObserver):
-    """Keeps what the loop of a trial shows."""
-
-    def __init__(self) -> None:
-        self.sensing: list[SensingStep] = []
-        self.tasks: list[TaskStep] = []
-
-    def sensed(self, step: SensingStep) -> None:
-        self.sensing.append(step)
-
-    def acted(self, step: TaskStep) -> None:
-        self.tasks.append(step)
-
-
 @pytest.fixture
 def recorded(workplace: Workplace) -> Recorded:
     def run(text: str = CONFIGURATION) -> RunArrays:
@@ -72,7 +57,7 @@ def test_the_arrays_are_what_was_run(recorded: Recorded, problem: str) -> None:
     configuration = run.configuration
     assert run.trials == (0, 1, 2)
     for number, trial in enumerate(run.read()):
-        seen = Seen()
+        seen = Steps()
         result = decided(configuration, number, observer=seen)
         assert trial.result is not None
         assert trial.result.digest == result.digest == run.results["digest"][number]

@@ -1,10 +1,11 @@
 """Whose turn it is."""
 
 import pytest
-from tests.unit.test_protocol_service import Robot, make_problem
+from tests.unit.test_protocol_service import Robot
+from tests.unit.test_service_jobs import job
 
 from holdfast.protocol.computing_time import ExpectedTime
-from holdfast.protocol.messages import Request, pack_configuration
+from holdfast.protocol.messages import Request
 from holdfast.protocol.request_queue import RequestQueue
 from holdfast.protocol.service_jobs import Job
 from holdfast.protocol.service_limits import ServiceLimits
@@ -40,21 +41,9 @@ class TestRequestQueue:
     def run_one(self) -> tuple[bytes, Job]:
         task = self.queue.take(self.now)
         assert task is not None
-        robot = Robot()
-        job = Job(
-            "sensing",
-            None,
-            make_problem,
-            str,
-            pack_configuration(robot.session_configuration),
-            robot.session_configuration.planning,
-            5,
-            ServiceLimits(),
-            task.request,
-            None,
-        )
-        self.queue.handed_out(task, job, 0.0)
-        return task.digest, job
+        own = job(Robot(), task.request)
+        self.queue.handed_out(task, own, 0.0)
+        return task.digest, own
 
     def finish(self, job: Job) -> None:
         task, _ = self.queue.end(job)
@@ -144,22 +133,6 @@ def made(
         state=None,
         size=size,
         since=since,
-    )
-
-
-def job_of(task: PendingTask) -> Job:
-    configuration = Robot().session_configuration
-    return Job(
-        "sensing",
-        None,
-        make_problem,
-        str,
-        pack_configuration(configuration),
-        configuration.planning,
-        5,
-        ServiceLimits(),
-        task.request,
-        None,
     )
 
 
@@ -259,14 +232,14 @@ class TestTheWait:
         self.queue.enqueue(task)
         assert self.queue.take(1.0) is task
         assert self.wait_s(1.0) == 0.0
-        job = job_of(task)
-        self.queue.handed_out(task, job, 1.0)
+        own = job(Robot(), task.request)
+        self.queue.handed_out(task, own, 1.0)
         running = [task.running]
         assert self.wait_s(1.02) == pytest.approx(0.03 / 4)
-        self.queue.started(job, 1.5)
+        self.queue.started(own, 1.5)
         assert self.wait_s(1.51) == pytest.approx(0.04 / 4)
         assert self.wait_s(9.0) == 0.0  # longer than was expected
-        assert self.queue.end(job) == (task, 1.5)
+        assert self.queue.end(own) == (task, 1.5)
         assert [*running, task.running] == [True, False]
         assert (len(self.queue.running), self.wait_s(1.5)) == (0, 0.0)
 

@@ -4,8 +4,8 @@ import re
 from pathlib import Path
 
 import pytest
-from prometheus_client.parser import text_string_to_metric_families
 from tests.robot_world import Misleading, World
+from tests.unit.test_service_metrics import Samples, samples_of
 from tests.unit.test_verification import lie, other_actions
 
 from holdfast.planning.settings import SimulatorSettings
@@ -14,16 +14,9 @@ from holdfast.robot.metrics import RobotMetrics
 
 RULES = Path(__file__).parents[2] / "deploy" / "prometheus" / "rules.yaml"
 
-Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
-
 
 def told(metrics: RobotMetrics, world: World, *, is_deciding: bool = True) -> Samples:
-    text = metrics.text(world.robot, is_deciding=is_deciding).decode()
-    return {
-        (sample.name, tuple(sorted(sample.labels.items()))): sample.value
-        for family in text_string_to_metric_families(text)
-        for sample in family.samples
-    }
+    return samples_of(metrics.text(world.robot, is_deciding=is_deciding).decode())
 
 
 class Lying(Misleading):

@@ -6,6 +6,7 @@
 import csv
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -246,6 +247,15 @@ def test_what_a_finished_run_can_do_without_may_fail(
     assert workplace.summary("out")["finished"] == 1
 
 
+def test_how_many_trials_ended_sure_of_a_wrong_value(workplace: Workplace) -> None:
+    workplace.write("bits.py", "from tests.unit.test_lost_values import Bit\n")
+    bit = PEG.replace("peg_in_hole_2d", "bits:Bit")
+    workplace.write("bit.yaml", f"{bit}\nselector: {{method: random}}\n")
+    said = workplace.runs("run", "bit.yaml", "--trials", "20", "--out", "out")
+    assert re.search(r"note: \d+ of 20 trials ended sure .* bit\. Resampling loses", said.stderr)
+    assert "in trial 0" not in said.stderr
+
+
 def test_values_instead_of_the_files_are_a_part_of_what_must_be_the_same_to_go_on(
     workplace: Workplace,
 ) -> None:
@@ -374,7 +384,7 @@ def test_a_problem_whose_class_is_not_named(workplace: Workplace) -> None:
 class TestAfterAReboot:
     """A robot goes on in another boot of its machine only if a person says so."""
 
-    ROBOT = ("run", "peg.yaml", "--rate", "10000", "--quiet", "--out", "out")
+    ROBOT = ("run", "peg.yaml", "--rate", "10000", "--quiet", "--jobs", "1", "--out", "out")
 
     @pytest.fixture
     def boot(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:

@@ -16,7 +16,7 @@ from holdfast.protocol.service_limits import ServiceLimits
 
 def job(
     robot: Robot,
-    request: Request,
+    request: Request | None,
     kind: Literal["task", "sensing"] = "sensing",
     limits: ServiceLimits | None = None,
 ) -> Job:

@@ -19,14 +19,18 @@ from holdfast.service.metrics import DecisionTimes, ServiceReport, service_expos
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 
 
-def told(report: ServiceReport, processes: Sequence[int] = ()) -> Samples:
-    own = (os.getpid(),)
-    text = service_exposition("cloud_active_sensing", report, processes or own).decode()
+def samples_of(text: str) -> Samples:
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
         for family in text_string_to_metric_families(text)
         for sample in family.samples
     }
+
+
+def told(report: ServiceReport, processes: Sequence[int] = ()) -> Samples:
+    own = (os.getpid(),)
+    text = service_exposition("cloud_active_sensing", report, processes or own).decode()
+    return samples_of(text)
 
 
 class TestWhatIsTold:

@@ -33,13 +33,7 @@ from holdfast.protocol.messages import (
 )
 from holdfast.protocol.robot_events import CallEnded, ReplyReceived, ServiceAppeared, TransportEvent
 from holdfast.protocol.service import Service
-from holdfast.protocol.service_jobs import (
-    EndCall,
-    Job,
-    JobResult,
-    SendReply,
-    ServiceEffect,
-)
+from holdfast.protocol.service_jobs import EndCall, Job, JobResult, SendReply, ServiceEffect
 from holdfast.protocol.service_limits import ServiceLimits
 from holdfast.service import shell
 from holdfast.service.problem_factory import ProblemFactory

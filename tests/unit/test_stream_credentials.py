@@ -48,6 +48,21 @@ async def until(condition: Callable[[], bool], what: object = None) -> None:
         await asyncio.sleep(0.005)
 
 
+class Ends(list[StreamRobotTransport | StreamServiceTransport]):
+    async def close_on_loop(self) -> None:
+        while self:
+            await self.pop().close()
+
+
+OPEN = Ends()
+
+
+@pytest.fixture(autouse=True)
+def ends() -> Ends:
+    """Have what a test opens closed at its end, robots first."""
+    return OPEN
+
+
 class Robot:
     """A robot's end, and what it was told."""
 
@@ -60,6 +75,7 @@ class Robot:
             tls=TlsFiles.of(directory),
             on_event=lambda _, **fields: self.refusals.append(fields["reason"]),
         )
+        OPEN.append(self.transport)
         self.transport.start(self.events.append)
 
     @property
@@ -100,6 +116,7 @@ class Cloud:
         )
 
     async def start(self) -> str:
+        OPEN.append(self.transport)
         await self.transport.start(self._received)
         return self.transport.endpoints[0]
 
@@ -148,8 +165,6 @@ async def test_a_revoked_robots_link_ends_and_no_other(tmp_path: Path) -> None:
     ] * 2
     told = [fields for name, fields in cloud.told if name == "robot_disconnected"]
     assert [(each["robot"], each["reason"]) for each in told] == [("anna", REVOKED)]
-    for end in (anna.transport, berta.transport, cloud.transport):
-        await end.close()
 
 
 @contextlib.asynccontextmanager
@@ -191,7 +206,6 @@ async def test_nothing_of_a_revoked_robot_is_handled(tmp_path: Path, protocol: s
     ((name, fields),) = cloud.told
     assert (name, fields["robot"], fields["reason"]) == ("link_refused", "anna", REVOKED)
     assert cloud.held == []
-    await cloud.transport.close()
 
 
 async def test_a_rotated_robot_is_let_in_by_itself(tmp_path: Path) -> None:
@@ -206,8 +220,6 @@ async def test_a_rotated_robot_is_let_in_by_itself(tmp_path: Path) -> None:
     make_credentials(tmp_path, robots=["anna"], rotate=True)
     await until(lambda: len(anna.boots) == 2, (anna.events, anna.refusals))
     assert await anna.ask(1) == [b"anna"]
-    for end in (anna.transport, cloud.transport):
-        await end.close()
 
 
 async def test_a_robot_believes_no_service_that_is_revoked(tmp_path: Path) -> None:
@@ -227,8 +239,6 @@ async def test_a_robot_believes_no_service_that_is_revoked(tmp_path: Path) -> No
     cloud.transport.end_links(lambda _: "is to come again")
     await until(lambda: wanted in first.refusals, first.refusals)
     assert first.boots == ["b1"]
-    for end in (first.transport, second.transport, cloud.transport):
-        await end.close()
 
 
 def put(directory: Path, other: Path, *, believing: list[Path]) -> None:
@@ -262,8 +272,6 @@ async def test_links_end_whose_authority_is_replaced_and_no_others(tmp_path: Pat
     assert berta.boots == ["b1"]
     told = [fields for name, fields in cloud.told if name == "robot_disconnected"]
     assert [(each["robot"], each["reason"]) for each in told] == [("anna", FOREIGN)]
-    for end in (anna.transport, berta.transport, cloud.transport):
-        await end.close()
 
 
 async def test_who_has_shown_a_certificate_and_said_no_hello_is_ended_with_the_others(
@@ -289,7 +297,6 @@ async def test_who_has_shown_a_certificate_and_said_no_hello_is_ended_with_the_o
         (last,) = FrameDecoder(1000).feed(told)
         assert read_goodbye(last.payload) == REVOKED
         assert [link.peer.name for link in waiting if link.peer] == ["berta"]
-    await cloud.transport.close()
 
 
 @pytest.mark.parametrize("reason", [REVOKED, FOREIGN])
@@ -317,7 +324,6 @@ async def test_who_shook_hands_before_the_files_came_is_not_let_in_after_them(
     assert last.kind == GOODBYE
     assert read_goodbye(last.payload) == reason
     assert [name for name, _ in cloud.told] == ["link_refused"]
-    await cloud.transport.close()
 
 
 async def test_credentials_that_cannot_be_read_leave_those_of_before(tmp_path: Path) -> None:
@@ -331,8 +337,6 @@ async def test_credentials_that_cannot_be_read_leave_those_of_before(tmp_path: P
         (tmp_path / "cloud" / name).unlink()
     anna = Robot(tmp_path / "anna", endpoint)
     await anna.connected()
-    for end in (anna.transport, cloud.transport):
-        await end.close()
 
 
 async def test_files_of_a_robot_that_do_not_belong_together_leave_those_of_before(
@@ -348,8 +352,6 @@ async def test_files_of_a_robot_that_do_not_belong_together_leave_those_of_befor
     (told,) = [each for each in anna.refusals if "key.pem: is not the key of " in each]
     assert told.endswith("certificate.pem; the previous ones stay in use")
     assert await anna.ask(1) == [b"anna"]
-    for end in (anna.transport, cloud.transport):
-        await end.close()
 
 
 def short_lived(directory: Path, seconds: float, **names: list[str]) -> None:
@@ -371,8 +373,6 @@ async def test_a_robots_link_ends_when_its_certificate_expires(tmp_path: Path) -
     assert anna.boots == ["b1"]
     assert berta.boots == ["b1"]
     assert not berta.vanished
-    for end in (anna.transport, berta.transport, cloud.transport):
-        await end.close()
 
 
 async def test_a_robot_leaves_a_service_whose_certificate_expires(tmp_path: Path) -> None:
@@ -383,5 +383,3 @@ async def test_a_robot_leaves_a_service_whose_certificate_expires(tmp_path: Path
     await anna.connected()
     await until(lambda: bool(anna.vanished), anna.events)
     assert "has a certificate that has expired" in anna.refusals
-    for end in (anna.transport, cloud.transport):
-        await end.close()

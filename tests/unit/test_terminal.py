@@ -24,7 +24,7 @@ def test_the_summary_says_which_mean_of_the_steps_it_has(
         summary.add(result_of(trial))
     built = summary.build(problem="peg", seed=1, version="1", trials=2, wall_time_s=1.0)
     print_summary(built)
-    assert f"{built.mean_steps:.4g}  (arithmetic mean)" in capsys.readouterr().out
+    assert f"{built.mean_steps:.4g}  (of the steps made)" in capsys.readouterr().out
 
 
 def test_a_count() -> None:

@@ -17,7 +17,7 @@ from holdfast.errors import DescriptorError, InvalidValueError, TrialError, Work
 from holdfast.planning.planner import Planner
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 from holdfast.robot import trial_pool
-from holdfast.robot.trial import TrialObserver
+from holdfast.robot.lost_values import LostValues
 from holdfast.robot.trial_pool import Arm, TrialPool
 
 
@@ -236,7 +236,7 @@ def test_an_overdue_trial_costs_its_worker_and_no_other_trial(
 
 def test_a_daemonic_process_starts_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What fails there, and is nothing of its problem, has a note that names the trial."""
-    observer = TrialObserver()
+    observer = LostValues()
     vars(observer)["trial_began"] = float  # which takes no environment
     arm, _ = arms_of(tmp_path)
     daemon = vars(multiprocessing.current_process())["_config"]

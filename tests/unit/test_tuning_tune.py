@@ -47,13 +47,13 @@ def test_what_it_finds_and_writes(run: Path) -> None:
     }
     rows = (out / "trials.csv").read_text().splitlines()
     assert len(rows) == 1 + len(set(rows[1:]))
-    trials = {int(row.rsplit(",", 7)[1]) for row in rows[1:]}
+    trials = {int(row.rsplit(",", 8)[1]) for row in rows[1:]}
     assert trials == {*range(6), *range(FRESH, FRESH + 12)}
     # The same worlds, so a trial is what a run makes of it.
     result = hf.run_trial(
         hf.Planner(load(run).problem, load(run).planning), seed=3, trial=0, max_steps=25
     )
-    assert rows[1].startswith(f"as configured,0,{int(result.success)},0,{result.steps},")
+    assert rows[1].startswith(f"as configured,0,{int(result.success)},0,,{result.steps},")
 
 
 def test_candidates_that_die_hang_or_fail_leave_the_race(
@@ -91,6 +91,14 @@ def test_the_configuration_itself_dies_or_hangs(
     run.write_text(OF_MEAN.replace("num_particles: 30", f"num_particles: {particles}"))
     with pytest.raises(error, match=message):
         tuned(run)
+
+
+def test_it_says_that_particles_are_too_few(run: Path) -> None:
+    (run.parent / "bits.py").write_text("from tests.unit.test_lost_values import Bit\n")
+    run.write_text(RUN.replace("peg_in_hole_2d", "bits:Bit"))
+    found = tuned(run, vary=["fixed"], most=20)
+    more = f"tune {run} --set particle_filter.num_particles=300."
+    assert re.search(rf" But \d+ of 40 trials ended sure of a wrong .* {more}", found.sentence)
 
 
 OF_MEAN = RUN.replace("peg_in_hole_2d", "mean:Mean") + "selector: {method: fixed}\n"
@@ -176,7 +184,8 @@ class Counted(Line):
 
 
 def test_what_is_refused(run: Path) -> None:
-    with pytest.raises(InvalidValueError, match=r"vary has 'method'; allowed are methods"):
+    says = r"vary has 'method'; allowed are methods, .*; did you mean methods\?"
+    with pytest.raises(InvalidValueError, match=says):
         tuned(run, vary=["method"])
     for name, value, words in (
         ("most", 1, "most 1: allowed are whole numbers from 2 "),

@@ -24,17 +24,8 @@ def rows(
     """Return trials that take so many steps more than others of the same worlds, about."""
     noise = np.random.default_rng(list(name.encode())).normal(0.0, 4.0, len(WORLDS))
     return [
-        TrialRow(
-            name,
-            n,
-            n not in failures,
-            False,
-            round(steps + more + noise[n]),
-            reward,
-            decision_ms,
-            0.1,
-        )
-        for n, steps in enumerate(WORLDS.tolist())
+        TrialRow(name, n, n not in failures, False, "", steps, reward, decision_ms, 0.1)
+        for n, steps in enumerate(np.rint(WORLDS + more + noise).astype(int).tolist())
     ]
 
 

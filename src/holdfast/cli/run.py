@@ -74,6 +74,7 @@ def _run(options: RunOptions) -> int:
     from holdfast.reports.belief_remarks import belief_remarks
     from holdfast.reports.recorder import Recorder
     from holdfast.robot.environment_maker import load_environment
+    from holdfast.robot.lost_values import REMEDY, remark_on_lost_values
     from holdfast.robot.recomputing import resume_run, resume_run_if_begun
     from holdfast.robot.trials import run_trials
     from holdfast.runtime.machine import available_cores
@@ -124,6 +125,7 @@ def _run(options: RunOptions) -> int:
         recorder = Recorder(0, Planner(configuration.problem, configuration.planning))
         robot = RobotFindings()
         summary: RunSummary | None = None
+        lost: list[tuple[str, ...]] = []
         started = perf_counter()
 
         def on_result(result: TrialResult) -> None:
@@ -140,7 +142,7 @@ def _run(options: RunOptions) -> int:
                 else:
                     manager.ready()
                     manager.close()
-                    run_trials(
+                    lost = run_trials(
                         configuration,
                         options.jobs or available_cores(),
                         directory.journal.finished(),
@@ -206,7 +208,10 @@ def _run(options: RunOptions) -> int:
             notes.note(remark.text)
         with notes.instead_of_errors("remarks on the beliefs"):
             problem, record = configuration.problem, recorder.record
-            for text in belief_remarks(problem, configuration.planning, record):
+            if told := remark_on_lost_values(lost):
+                notes.note(f"{told}. {REMEDY}")
+            planning, is_told = configuration.planning, bool(told)
+            for text in belief_remarks(problem, planning, record, lost_are_told=is_told):
                 notes.note(f"in trial {recorder.trial}, {text}")
         if summary.unverified_answers:
             notes.note(
@@ -228,21 +233,12 @@ def _run(options: RunOptions) -> int:
 
 
 class RobotFindings:
-    """An event sink, for what a robot's run finds besides its results.
-
-    Attributes
-    ----------
-    missed_ticks : int
-        Ticks of ``--rate`` that came late.
-    refusals : dict of str
-        Why a service was given up, by its name.
-    unreachable : dict of str
-        Why a service could not be reached the last time, by its name.
-    """
+    """An event sink, for what a robot's run finds besides its results."""
 
     def __init__(self, on_first_hold: Callable[[], None] = lambda: None) -> None:
         self._on_hold: Callable[[], None] | None = on_first_hold
-        self.missed_ticks = 0
+        self.missed_ticks = 0  # ticks of --rate that came late
+        # Why a service was given up, and could not be reached the last time, by its name.
         self.refusals: dict[str, str] = {}
         self.unreachable: dict[str, str] = {}
 
@@ -355,7 +351,7 @@ def _note_idle_services(
 
 def _require_effect(options: RunOptions, configuration: Configuration, *, as_robot: bool) -> None:
     """Refuse options that would have no effect."""
-    if options.jobs is not None and as_robot:
+    if options.jobs not in (None, 1) and as_robot:
         raise InvalidValueError(
             f"--jobs is {options.jobs}, but a robot runs its trials one after another: leave it "
             "out, or leave out --service, --environment, --rate and --view (and offload.services "

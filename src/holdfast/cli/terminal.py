@@ -278,7 +278,7 @@ def _summary_rows(summary: RunSummary) -> list[tuple[str, str]]:
             value += f"  (successful trials: {summary.mean_reward_of_successes:.4g})"
         rows.append(("mean reward", value))
     if summary.mean_steps is not None:
-        rows.append(("mean steps", f"{summary.mean_steps:.4g}  (arithmetic mean)"))
+        rows.append(("mean steps", f"{summary.mean_steps:.4g}  (of the steps made)"))
     if summary.sensing_ms_median is not None:
         rows.append(
             (

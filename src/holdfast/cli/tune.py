@@ -48,10 +48,12 @@ def _seconds(text: str) -> float:
 def variations(text: str) -> str:
     """Read what is to be tried, separated by commas."""
     from holdfast.tuning.candidates import VARIATIONS
+    from holdfast.validation import close_match
 
     for each in text.split(","):
         if each not in VARIATIONS:
-            raise command_line.bad_value(text, f"lists of {', '.join(VARIATIONS)}, with commas")
+            allowed = f"{', '.join(VARIATIONS)}, with commas between"
+            raise command_line.bad_value(each, allowed + close_match(each, VARIATIONS))
     return text
 
 

@@ -50,16 +50,10 @@ _StructT = TypeVar("_StructT", bound=msgspec.Struct)
 class Source:
     """A configuration before it is checked, which can say where in it something is wrong.
 
-    Attributes
-    ----------
-    schemas : dict
-        The type of each section that has one; a problem's own are added to it.
-    problem, problem_directory : object
-        What stands on top.
-    directory, current : Path
-        That of the file, and the current one when this was made.
-    sections : dict
-        The data of each section, that of ``overrides`` (``section.key``) included.
+    ``schemas`` has the type of each section that has one (a problem's own are added), ``sections``
+    the data of each, that of ``overrides`` (``section.key``) included. ``problem`` and
+    ``problem_directory`` stand on top. ``directory`` is that of the file, ``current`` the current
+    one when this was made.
     """
 
     def __init__(self, document: Document, path: Path, overrides: Mapping[str, Any]) -> None:

@@ -98,13 +98,8 @@ class RunDirectory:
 
     Use :meth:`create`, or ``resume_run`` and ``resume_run_if_begun`` of
     :mod:`holdfast.robot.recomputing`, and close it or use it in a ``with`` statement.
-
-    Attributes
-    ----------
-    services_before : tuple of str, or None
-        Those of the part before; None for a new run.
-    before_upgrade : EarlierCode or None
-        What another version decided, if this is the first to go on after it.
+    ``services_before`` are those of the part before, None for a new run, and ``before_upgrade`` is
+    what another version decided, if this is the first to go on after it.
     """
 
     def __init__(

@@ -350,13 +350,7 @@ def regularised(
     Each is drawn from a normal kernel about its particle's value, which is first shrunk towards the
     mean: so mean and covariance stay those of the belief, however often it is resampled. Source:
     Liu and West, "Combined parameter and state estimation in simulation-based filtering", 2001.
-
-    Parameters
-    ----------
-    drawn, weighted : Belief
-        After resampling, and before.
-    static, circular : sequence of int
-        The coordinates, and those that are angles.
+    ``weighted`` is the belief before resampling; ``circular`` are all coordinates that are angles.
     """
     own = list(static)
     angles = [own.index(each) for each in circular if each in own]

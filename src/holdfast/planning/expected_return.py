@@ -176,18 +176,10 @@ def rollout_returns(
 ) -> FloatArray:
     """Return the discounted returns, shape (J, M), of robots that act on a belief, up to the goal.
 
-    They lack what is the same for all J: a rollout ends where only that is left.
-
-    Parameters
-    ----------
-    true_states : array of shape (M, state_size)
-        Of the robots.
-    estimates : array of shape (J, M, state_size)
-        The states that they assume after each of J observations.
-    clouds : array of shape (J, M, L, state_size)
-        Some particles of these beliefs. By their mean displacement the estimates move.
-    motion : Stream
-        The noise of the motion, the same for all J.
+    They lack what is the same for all J: a rollout ends where only that is left. ``true_states``,
+    (M, state_size), are those of the robots, ``estimates``, (J, M, state_size), what they assume
+    after each of J observations; and ``clouds``, (J, M, L, state_size), are some particles of these
+    beliefs, by whose mean displacement the estimates move. All J have the same ``motion`` noise.
     """
     costs = sensing_costs(problem, optional=settings.selector.sensing_is_optional)
     roll_out = _rollouts_of(problem, settings, costs)

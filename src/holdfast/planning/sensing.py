@@ -82,19 +82,11 @@ class SensingInfo(NamedTuple):
 
 
 class Predictions(NamedTuple):
-    """What the problem's functions say of n particles, each by itself.
+    """What the problem's functions say of n particles, each by itself."""
 
-    Attributes
-    ----------
-    sets : array of shape (K, n, d)
-        The points whose entropies count, each set by its one of ``factors``.
-    factors : tuple of float
-    shown : tuple or None
-        Of :func:`holdfast.problems.checked.predictions`; None for a general likelihood.
-    """
-
-    sets: FloatArray
+    sets: FloatArray  # (K, n, d): points whose entropies count, each set by its one of the factors
     factors: tuple[float, ...]
+    # Of :func:`holdfast.problems.checked.predictions`; None for a general likelihood.
     shown: tuple[list[int], FloatArray, FloatArray] | None
 
     def of(self, some: slice) -> Predictions:

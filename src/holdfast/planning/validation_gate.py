@@ -59,16 +59,9 @@ def is_within(
 ) -> bool:
     """Tell whether an observation is near the mean prediction of all particles.
 
-    Parameters
-    ----------
-    observed : array of shape (observation_size,)
-    mean : array of shape (num_particles, observation_size)
-        What each particle predicts.
-    variance : array of shape (observation_size,) or (num_particles, observation_size)
-        Of the sensor's noise.
-    weights : array of shape (num_particles,)
-    circular : sequence of int
-        Coordinates of the observation that are angles.
+    ``mean``, of shape (num_particles, observation_size), is what each particle predicts, and
+    ``variance`` that of the sensor's noise, of this shape or one row for all. ``circular`` are the
+    coordinates of the observation that are angles.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         squared = _squared_distance(observed, mean, variance, weights, circular)

@@ -59,6 +59,10 @@ GAUSSIAN_OBSERVATIONS = ("observation_mean", "observation_variance")
 """Functions that a problem with a likelihood of its own need not have."""
 
 
+_NEARLY = 0.82
+"""Likeness (difflib's) from which on a name is taken for another one, as is_failed for is_failure;
+observation_size, which a problem may well have, is less like observation_mean."""
+
 NEEDED = ("initial_states", "move", "policy", "is_goal")
 """Functions without which no problem can be used; its observations are needed, too."""
 
@@ -152,7 +156,7 @@ def _misspelt(kind: type, of_instance: frozenset[str]) -> str:
     found = [
         f"{name}: did you mean {meant[0]}?"
         for name in sorted(names - known)
-        if (meant := difflib.get_close_matches(name, lacking, n=1, cutoff=0.9))
+        if (meant := difflib.get_close_matches(name.lower(), lacking, n=1, cutoff=_NEARLY))
     ]
     return f"; it has {', and '.join(found)}" if found else ""
 
@@ -302,6 +306,12 @@ def state_labels(problem: Any) -> tuple[str, ...]:
             "one for each coordinate of a state, or empty"
         )
     return tuple(map(str, labels))
+
+
+def coordinate_name(problem: Any, number: int) -> str:
+    """Return what messages call a coordinate of a state."""
+    labels = state_labels(problem)
+    return labels[number] if labels else f"coordinate {number} of a state"
 
 
 def circular_states(problem: Any) -> Sequence[int]:

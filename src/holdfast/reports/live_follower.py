@@ -61,10 +61,7 @@ class FollowerReport(msgspec.Struct, array_like=True, frozen=True):
 class Follower:
     """Makes facts of what a run writes; times are in nanoseconds since 1970.
 
-    Attributes
-    ----------
-    steps, left_out : int
-        Task actions so far, and those that were too old to be shown.
+    ``steps`` counts the task actions so far, ``left_out`` those that were too old to be shown.
     """
 
     def __init__(

@@ -13,7 +13,8 @@ from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.problems.attributes import circular_states
 from holdfast.robot.environment import Environment
-from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver
+from holdfast.robot.lost_values import LostValues
+from holdfast.robot.trial import SensingStep, TaskStep
 
 MAX_PARTICLES_KEPT = 500
 """Particles kept of a belief; more would not show in a figure."""
@@ -36,10 +37,11 @@ class TrialRecord:
     # Of their beliefs at most 500 particles each, with weights that are normalised.
     sensing: list[SensingStep] = field(default_factory=list)
     result: TrialResult | None = None  # None while the trial runs
+    lost_values: tuple[str, ...] = ()  # :class:`LostValues`, of a simulated world
 
 
-class Recorder(TrialObserver):
-    """An observer that records one trial and ignores all others.
+class Recorder(LostValues):
+    """An observer that records one trial, and of all others only the values that they lose.
 
     A planner says what is estimated, and its problem which coordinates are angles; without one the
     estimate is the mean. ``record`` is complete when ``record.result`` is not None.
@@ -52,6 +54,7 @@ class Recorder(TrialObserver):
 
     def trial_began(self, environment: Environment, state: PlanningState) -> None:
         """Start a new record if this is the trial."""
+        super().trial_began(environment, state)
         if state.trial == self.trial:
             self.record = TrialRecord()
             self._keep(true_state(environment))
@@ -80,12 +83,13 @@ class Recorder(TrialObserver):
     @in_own_mode
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
         """Keep the last belief and the outcome."""
+        super().trial_ended(state, result)
         if state.trial != self.trial:
             return
         if self._keeps(state):
             self.record.estimates.append(self._estimate(state))
             self.record.standard_deviations.append(self._deviation(state))
-        self.record.result = result
+        self.record.result, self.record.lost_values = result, self.lost
 
     def _deviation(self, state: PlanningState) -> FloatArray:
         circular = () if self._planner is None else circular_states(self._planner.problem)

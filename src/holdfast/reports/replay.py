@@ -56,22 +56,11 @@ class RecordedRun:
     OutputError if it is no run, or damaged; UntrustedCodeError if its problem is a class of a
     module, and nobody says where that lies; HoldfastError if its problem cannot be built any more.
 
-    Attributes
-    ----------
-    configuration : Configuration
-        The settings that decide; it names no services and no environment.
-    journal : JournalReader
-    trials : tuple of int
-        All trials that have facts, in order: the finished ones, and the unfinished one.
-    has_times : bool
-        Whether the facts have the robot's times.
-    untimed : tuple of int
-        Trials that the table of times lacks although it has others; then no fact has the robot's
-        times.
-    clock_notes : tuple of str
-        How the robot's wall clock was set while it ran.
-    observer : TrialObserver
-        Gets the steps of what is replayed, beside the facts.
+    ``configuration`` has the settings that decide, no services and no environment. ``trials`` are
+    all that have facts, in order: the finished ones, and the unfinished one. ``has_times`` is
+    whether facts have the robot's times: none has, if the table of times lacks the trials
+    ``untimed`` although it has others. ``clock_notes`` say how the robot's wall clock was set while
+    it ran. ``observer`` gets the steps of what is replayed, beside the facts.
     """
 
     observer: TrialObserver = NULL_OBSERVER

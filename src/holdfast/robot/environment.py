@@ -101,6 +101,7 @@ class SimulatedEnvironment(KeepsReadOnly):
 
     Attributes
     ----------
+    problem : Problem
     state : array of shape (state_size,)
         The true state.
     step : int
@@ -109,7 +110,7 @@ class SimulatedEnvironment(KeepsReadOnly):
 
     @in_own_mode
     def __init__(self, problem: Problem, seed: int, trial: int = 0) -> None:
-        self._problem = problem
+        self.problem = problem
         self._seed, self._trial = seed, trial = seed_and_trial(seed, trial)
         self.step = 0
         check_sizes(problem)
@@ -136,7 +137,7 @@ class SimulatedEnvironment(KeepsReadOnly):
         InvalidValueError
             If the sensing action does not exist.
         """
-        problem = self._problem
+        problem = self.problem
         sensing_action = sensing_action_of(problem, sensing_action)
         noise = stream(self._seed, self._trial, self.step, Purpose.WORLD_OBSERVATION)
         if hasattr(problem, "sample_observation"):
@@ -155,7 +156,7 @@ class SimulatedEnvironment(KeepsReadOnly):
         None if the problem defines no reward. A problem that has ``measure_motion`` or
         ``sample_move_observation`` says what else the move shows.
         """
-        seed, trial, step, problem = self._seed, self._trial, self.step, self._problem
+        seed, trial, step, problem = self._seed, self._trial, self.step, self.problem
         before, action = self.state, floats("task action", task_action)
         noise = stream(seed, trial, step, Purpose.WORLD_MOTION)
         state = checked.move(problem, before, action, noise)
@@ -175,9 +176,9 @@ class SimulatedEnvironment(KeepsReadOnly):
     @in_own_mode
     def is_done(self) -> Done:
         """Return whether the true state is a goal, or ``"failed"`` if it is a failure."""
-        if checked.is_failure(self._problem, self.state):
+        if checked.is_failure(self.problem, self.state):
             return "failed"
-        return checked.is_goal(self._problem, self.state)
+        return checked.is_goal(self.problem, self.state)
 
     def steps_performed(self) -> int:
         """Return the number of task actions performed, those of :meth:`after` included."""
@@ -220,16 +221,9 @@ class CheckedEnvironment:
     """Calls an environment, and checks what it returns.
 
     Methods raise whatever the environment raises, and an EnvironmentFailedError, with the method's
-    name, for what does not keep to its contract.
-
-    Attributes
-    ----------
-    environment : Environment or None
-        None until it is made.
-    method : str
-        The one that was called last; at first the environment's name.
-    performed : Acted or None
-        What the last task action has shown; what is asked after it may fail.
+    name, for what does not keep to its contract. ``environment`` is None until it is made,
+    ``method`` the one that was called last (at first the environment's name), and ``performed``
+    what the last task action has shown: what is asked after it may fail.
     """
 
     def __init__(

@@ -51,7 +51,8 @@ from holdfast.planning.planner import Planner
 from holdfast.planning.settings import LostSettings, PlanningSettings
 from holdfast.printable import brief
 from holdfast.problems.problem import Problem
-from holdfast.robot.trial import NULL_OBSERVER, TrialObserver, run_trial
+from holdfast.robot.lost_values import LostValues
+from holdfast.robot.trial import run_trial
 from holdfast.runtime.command_line import MAX_JOBS
 from holdfast.runtime.descriptors import NEEDED, allow_descriptors
 from holdfast.runtime.machine import available_cores
@@ -101,12 +102,13 @@ class Arm:
 
 
 class FinishedTrial(NamedTuple):
-    """A trial that is finished, and the seconds that it took."""
+    """A trial that is finished, the seconds that it took, and :class:`LostValues` of it."""
 
     arm: Arm
     trial: int
     result: TrialResult
     elapsed_s: float
+    lost_values: tuple[str, ...]
 
 
 class TrialPool:
@@ -126,7 +128,7 @@ class TrialPool:
         jobs: int,
         *,
         expected: int | None = None,
-        observer: TrialObserver = NULL_OBSERVER,
+        observer: LostValues | None = None,
         overdue: Callable[[Arm, float], bool] | None = None,
         cluster: RayCluster | None = None,
     ) -> None:
@@ -136,7 +138,7 @@ class TrialPool:
         alone = multiprocessing.current_process().daemon
         self._jobs = 1 if alone else jobs
         self._expected = expected
-        self._observer = observer
+        self._observer = observer or LostValues()
         self._overdue = None if alone else overdue
         self._cluster = cluster
         self._queue: deque[tuple[Arm, int]] = deque()
@@ -216,22 +218,22 @@ class TrialPool:
         """Run the next trial in this process; return None if that takes too long."""
         no_help = self._jobs == 1 or self._remaining() <= 1
         arm, trial = self._queue.popleft()
+        observer = self._observer if no_help else _Watch()
         started = perf_counter()
         try:
-            result = _run_one(arm, trial, self._observer if no_help else _Watch())
+            result = _run_one(arm, trial, observer)
         except _TrialIsLongError:
             # It decides the same when a worker runs it again; only the time so far is lost.
             self._queue.appendleft((arm, trial))
             self._a_trial_is_long = True
             return None
-        return self._finished(arm, trial, result, perf_counter() - started)
+        elapsed_s = perf_counter() - started
+        return self._finished(FinishedTrial(arm, trial, result, elapsed_s, observer.lost))
 
-    def _finished(
-        self, arm: Arm, trial: int, result: TrialResult, elapsed_s: float
-    ) -> FinishedTrial:
-        for times in (self._all_times, self._times.setdefault(arm, _Times())):
-            times.add(elapsed_s)
-        return FinishedTrial(arm, trial, result, elapsed_s)
+    def _finished(self, finished: FinishedTrial) -> FinishedTrial:
+        for times in (self._all_times, self._times.setdefault(finished.arm, _Times())):
+            times.add(finished.elapsed_s)
+        return finished
 
     def _start_workers(self) -> None:
         """Start workers one by one, each noted first, so that they can always be ended."""
@@ -286,7 +288,7 @@ class TrialPool:
                 error = TrialError(message.text) if message.expected else crash
                 error.arm = arm
                 raise error
-            yield self._finished(arm, trial, message.result, message.elapsed_s)
+            yield self._finished(FinishedTrial(arm, trial, *msgspec.structs.astuple(message)))
         for connection, worker in by_connection.items():
             if self._overdue is not None and connection not in ready and worker.outstanding:
                 ran_s = perf_counter() - worker.began_s
@@ -328,7 +330,7 @@ class _TrialIsLongError(Exception):
     """Not an error: the trial that runs in this process is worth starting workers for."""
 
 
-class _Watch(TrialObserver):
+class _Watch(LostValues):
     """Gives a trial up once it has taken longer than workers need to start."""
 
     def __init__(self) -> None:
@@ -343,7 +345,7 @@ class _Watch(TrialObserver):
     acted = sensed
 
 
-def _run_one(arm: Arm, trial: int, observer: TrialObserver) -> TrialResult:
+def _run_one(arm: Arm, trial: int, observer: LostValues) -> TrialResult:
     where = f"trial {trial} (seed {arm.seed}){f' of {arm.label}' if arm.label else ''}"
     try:
         return run_trial(
@@ -381,6 +383,7 @@ class _Trial(msgspec.Struct):
 class _Finished(msgspec.Struct, tag="finished"):
     result: TrialResult
     elapsed_s: float
+    lost_values: tuple[str, ...]
 
 
 class _Built(msgspec.Struct, tag="built"):
@@ -484,14 +487,14 @@ class _Runner:
         request = _REQUESTS.decode(message)
         if request.new:
             self._arms[request.arm] = request.new
-        started = perf_counter()
+        started, observer = perf_counter(), LostValues()
         try:
             arm = self._arms[request.arm]
             if isinstance(arm, bytes):
                 self._arms[request.arm] = arm = _arm_in_worker(arm, self._threads, self._problems)
                 yield _ENCODE(_Built())
-            result = _run_one(arm, request.trial, NULL_OBSERVER)
-            answer = _ENCODE(_Finished(result, perf_counter() - started))
+            result = _run_one(arm, request.trial, observer)
+            answer = _ENCODE(_Finished(result, perf_counter() - started, observer.lost))
         except HoldfastError as error:
             answer = _ENCODE(_Failed(str(error), True))
         except Exception:  # noqa: BLE001 - whatever it is, the parent raises it again

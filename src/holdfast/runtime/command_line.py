@@ -246,7 +246,7 @@ class Options:
         try:
             found, unknown = parser.parse_known_intermixed_args(_marked(arguments))
         except argparse.ArgumentError as error:
-            raise OptionError(_complaint(error, program, arguments)) from None
+            raise OptionError(_complaint(error, cls, program, arguments)) from None
         if unknown:
             word = unknown[0].partition("=")[0]
             if not word.startswith("-"):
@@ -372,11 +372,14 @@ def _help(each: Option) -> str:
     return f"{text} (default: {default})"
 
 
-def _complaint(error: argparse.ArgumentError, program: str, arguments: Sequence[str]) -> str:
+def _complaint(
+    error: argparse.ArgumentError, options: type[Options], program: str, arguments: Sequence[str]
+) -> str:
     """Return the message about an argument, with its long name."""
     name = (error.argument_name or "").split("/")[0]
     if error.message == "expected one argument":
-        return f"{name} needs a value"
+        wanted = next(each.metavar for each in options.table().values() if name in each.names)
+        return f"{name} needs a value: {name} {wanted}"
     if error.message.startswith("ignored explicit argument"):
         value = error.message.partition("'")[2].removesuffix("'")
         # In -qx the letter is no value of -q.

@@ -70,10 +70,7 @@ class RayCluster:
 class RayProcess:
     """An actor in place of a process: its class's ``all_answers`` gets a message, returns several.
 
-    Attributes
-    ----------
-    how : str
-        How it ended, as the predicate of a sentence.
+    ``how`` it ended is the predicate of a sentence.
     """
 
     def __init__(self, cluster: RayCluster, runner: type, pipe: Connection, threads: int) -> None:

@@ -198,7 +198,7 @@ def remedy_of(values: FloatArray, truths: IntArray) -> tuple[str, str] | None:
     advice = "The log-likelihood is greatest where the observation is likely: "
     advice += "-0.5 * deviation * deviation."
     found = [(fit(negative), ". It fits better with the other sign", advice)]
-    if (values >= 0.0).all():
+    if likely := bool((values >= 0.0).all()):  # a log-likelihood hardly ever is
         seen = ". It fits better if the logarithm of the result is taken: log_likelihood seems to "
         seen += "return the likelihood"
         advice = "Return the logarithm: numerics.log(likelihood)."
@@ -213,4 +213,4 @@ def remedy_of(values: FloatArray, truths: IntArray) -> tuple[str, str] | None:
         advice += "-0.5 * (d / deviation)**2 and in stream.normal(loc, scale) it is the deviation."
         found.append((fits[best] - 0.01, seen, advice))
     gain, seen, advice = max(found)
-    return (seen, advice) if gain > fit(values) + _GAINS else None
+    return (seen, advice) if gain > fit(values) + _GAINS * (not likely) else None

@@ -25,7 +25,7 @@ from holdfast.numerics.randomness import Purpose, Stream, stream
 from holdfast.planning.planner import PlanningState
 from holdfast.planning.settings import PlanningSettings
 from holdfast.printable import one_line
-from holdfast.problems.attributes import sensing_labels, state_labels
+from holdfast.problems.attributes import coordinate_name, sensing_labels
 
 FALSE_ALARM_RATE = 0.001  # probability that all tests of a right problem together find an error
 OVER = "not looked at, or not at all of it: the time was over"  # of what the budget has cut short
@@ -47,6 +47,10 @@ WHERE = {
 _REMEDIES = (
     ("read-only", "It changes the array that it is given. Take a copy: states = states.copy()."),
     ("TimeoutError", "Look for a loop that need not end, such as one that draws until it fits."),
+    (
+        r"array of shape \(n,\)",
+        "It is asked for one state: return an array with one axis, np.array([value]) of a number.",
+    ),
     ("a stream is for", "Draw from the stream of this call alone, and do not keep it."),
     (
         "something else|global generator",
@@ -134,8 +138,7 @@ class Inspection:
 
     def coordinate(self, number: int) -> str:
         """Return what messages call a coordinate of a state."""
-        labels = state_labels(self.problem)
-        return labels[number] if labels else f"coordinate {number} of a state"
+        return coordinate_name(self.problem, number)
 
     def deadline(self, share: float, check: str = "") -> Callable[[], bool]:
         """Return a function that tells whether a check, if named, is over its share of the time."""
@@ -208,7 +211,7 @@ class Inspection:
             seen = seen if function in seen else f"{function}: {seen}"
         # One finding for what is broken, whoever calls it and with whatever states.
         frames = re.findall(r'^  File "(.+)", line \d+, in (.+)$', details, re.MULTILINE)
-        named = re.match(r"(\w+) of ", seen)
+        named = re.search(r"(?:^|: )(\w+) of ", seen)
         to_blame = " ".join(frames[-1]) if frames else named[1] if named else f"{function} {check}"
         if to_blame in self._blamed:
             return

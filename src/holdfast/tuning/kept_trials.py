@@ -30,6 +30,7 @@ class TrialRow(NamedTuple):
     trial: int
     success: bool
     failed: bool
+    lost_values: str  # names of coordinates (:class:`holdfast.robot.lost_values.LostValues`)
     steps: int
     reward: float | None
     decision_ms: float

@@ -66,16 +66,10 @@ class Standing(NamedTuple):
 
 
 def beats(differences: FloatArray, limit: float, error_rate: float) -> bool:
-    """Return whether the mean of paired differences is above zero, but for an error rate.
+    """Return whether the mean of paired differences, in order, is above zero.
 
-    Parameters
-    ----------
-    differences : array, (trials,)
-        In the order of the trials.
-    limit : float
-        Bound on their sizes; what exceeds it counts as this.
-    error_rate : float
-        Probability of True for a mean of at most zero, however often this is asked as trials come.
+    ``limit`` bounds their sizes; what exceeds it counts as this. ``error_rate`` is the probability
+    of True for a mean of at most zero, however often this is asked as trials come.
     """
     if limit <= 0.0 or not len(differences):
         return False
@@ -96,30 +90,16 @@ def race(
 ) -> list[Standing]:
     """Run trials of the candidates until it is known, or time is up, which has the least mean cost.
 
-    Parameters
-    ----------
-    candidates : sequence of str
-        The first one is never set aside, and of equals it wins.
-    run : callable
-        Runs trials, each given by candidate and number, and yields them in any order. It may leave
-        some out, of candidates that it then refuses, or as time is up.
-    limit : float, optional
-        Bound on the difference of two costs of a trial. None: the range of those seen so far, with
-        which the error rate holds only about.
-    most : int
-        Trials of a candidate.
-    budget_s : float
-        Seconds of a processor for all trials; the first ten of each quick candidate may exceed it.
-    error_rate : float
-        Bound on the probability that the best candidate is beaten.
-    refuse : callable
-        Returns why a candidate must not win, None if it may; asked after each round.
+    ``run`` runs trials, each given by candidate and number, and yields them in any order. It may
+    leave some out, of candidates that it then refuses, or as time is up. ``refuse`` returns why a
+    candidate must not win, None if it may; it is asked after each round. ``limit`` bounds the
+    difference of two costs of a trial; None is the range of those seen so far, with which the
+    ``error_rate``, at which the best candidate is beaten, holds only about. A candidate has at most
+    ``most`` trials; all take ``budget_s`` seconds of a processor, which the first ten of each quick
+    one may exceed. The first candidate is never set aside, and of equals it wins.
 
-    Returns
-    -------
-    list of Standing
-        The winner first: of the candidates still in the race the one with the least sum of mean
-        and deviation, so that a few lucky trials do not win. Then the others, by their means.
+    The winner comes first: of the candidates still in the race the one with the least sum of mean
+    and deviation, so that a few lucky trials do not win. Then the others, by their means.
     """
     costs: dict[str, FloatArray] = {name: np.empty(0) for name in candidates}
     seconds = dict.fromkeys(candidates, 0.0)

@@ -32,7 +32,8 @@ from holdfast.reports.outcome_comparison import (
     shown_estimate,
 )
 from holdfast.reports.table_formats import Table
-from holdfast.robot.trial_pool import Arm, TrialPool
+from holdfast.robot.lost_values import REMEDY, remark_on_lost_values
+from holdfast.robot.trial_pool import Arm, FinishedTrial, TrialPool
 from holdfast.runtime.command_line import MAX_SEED, MAX_TRIALS
 from holdfast.runtime.machine import available_cores
 from holdfast.validation import as_function, as_path
@@ -44,20 +45,24 @@ class SimulatedTrial(TrialResult, frozen=True, kw_only=True):
     """The result of a simulated trial, without its decisions.
 
     ``sensing_price`` is the sum of the prices of its sensing actions, which ``reward`` has lost
-    already; None if the problem has no prices.
+    already; None if the problem has no prices. ``lost_values`` names the coordinates of few values
+    (a bit, a colour) of which no particle had the true one at the end.
     """
 
     sensing_price: float | None = None
+    lost_values: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, result: TrialResult, problem: Problem) -> SimulatedTrial:
-        """Return a result that has its decisions, with the price."""
+    def of(cls, done: FinishedTrial) -> SimulatedTrial:
+        """Return the result of a trial that has just run."""
+        result, problem = done.result, done.arm.problem
         costs = sensing_costs(problem, optional=True)
         looks = [each for each in result.decisions or () if isinstance(each, Sensed)]
         priced = getattr(problem, "sensing_costs", None) is not None
         price = sum(float(costs[each.sensing_action]) for each in looks) if priced else None
         fields = {name: getattr(result, name) for name in TrialResult.__struct_fields__}
-        return cls(**{**fields, "decisions": None}, sensing_price=price)
+        fields |= {"decisions": None, "lost_values": done.lost_values}
+        return cls(**fields, sensing_price=price)
 
 
 class TrialSummary(Table):
@@ -69,6 +74,8 @@ class TrialSummary(Table):
     def __init__(self, trials: Trials) -> None:
         self._title, self._limit = str(trials.label), trials.max_steps
         self.estimates = estimates_of(trials.results, step_limit=self._limit)
+        lost = remark_on_lost_values([each.lost_values for each in trials])
+        self._remarks = [f"{lost}. {REMEDY}."] if lost else []
 
     def columns(self) -> Sequence[str]:
         """Return the names of the columns, for programs."""
@@ -84,8 +91,9 @@ class TrialSummary(Table):
         return [head, *map(shown_estimate, self.estimates)]
 
     def legend(self) -> str:
-        """Return how steps are defined."""
-        return f"steps: a trial that did not reach the goal counts as {self._limit:,} steps."
+        """Return how steps are defined, and what was lost."""
+        steps = f"a trial that did not reach the goal counts as {self._limit:,} steps"
+        return "\n".join([f"steps: the geometric mean; {steps}.", *self._remarks])
 
 
 class Trials(Table):
@@ -202,7 +210,7 @@ def run_trials(
     results: list[SimulatedTrial] = []
     with TrialPool(available_cores() if jobs is None else jobs, expected=n) as pool:
         for done in pool.run((arm, trial) for trial in range(n)):
-            results.append(SimulatedTrial.of(done.result, arm.problem))
+            results.append(SimulatedTrial.of(done))
             told(len(results), n)
     return table_of(arm, results)
 

@@ -26,7 +26,7 @@ from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.problems import attributes, checked
 from holdfast.problems.problem import ProblemBase
-from holdfast.robot.environment import SimulatedEnvironment
+from holdfast.robot.lost_values import REMEDY, LostValues, remark_on_lost_values
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 from holdfast.tuning.contract_check import acted, check_contract
 from holdfast.tuning.findings import CheckEndedError, Inspection, Severity, Walk, spread_out
@@ -117,8 +117,8 @@ def _report_angles(inspection: Inspection, jumps: IntArray, turns: IntArray) -> 
         for at in np.flatnonzero((counts[1] >= 2) & (counts[1] == counts[0])).tolist():
             seen = f"coordinate {at} of {whose} jumps by a whole turn (2 pi) in one step, and is "
             seen += "not declared to be an angle: the mean of 3.1 and -3.1 is taken for 0"
-            advice = f"Give the problem {attribute} = ({at},), and circular_observations if it "
-            advice += "is sensed; in a policy take numerics.wrapped(goal - heading)."
+            advice = f"Give the problem {attribute} = ({at},), and circular_observations to a "
+            advice += "Gaussian sensor; elsewhere take numerics.wrapped(goal - heading)."
             if at not in declared:
                 inspection.add("warning", "units", seen, advice)
 
@@ -217,7 +217,7 @@ def _slopes(problem: Any, state: FloatArray, action: FloatArray) -> FloatArray:
     return slopes
 
 
-class _Watcher(TrialObserver):
+class _Watcher(LostValues):
     """Keeps what the checks need of a trial, and ends it when time is over."""
 
     def __init__(self, inspection: Inspection, late: Callable[[], bool], keep: bool = True) -> None:
@@ -225,16 +225,11 @@ class _Watcher(TrialObserver):
         self.steps: list[SensingStep] = []
         self.outside: list[BoolArray] = []
 
-    def trial_began(self, environment: object, state: PlanningState) -> None:
-        """Keep the world, to look at the true state."""
-        del state
-        assert isinstance(environment, SimulatedEnvironment)
-        self.world = environment
-
     def sensed(self, step: SensingStep) -> None:
         """Note the step, and in which coordinates the true state was beyond all particles."""
         if not self.keep:
             return
+        assert self.world is not None
         self.steps.append(step)
         angles = attributes.circular_states(self.inspection.problem)
         apart = differences(step.before.belief.states, self.world.state, angles)
@@ -260,7 +255,9 @@ def check_trials(inspection: Inspection) -> None:
             results.append(_simulated(inspection, planner, trial, steps, watcher))
     if results:
         _report_endings(inspection, results, steps)
-    _report_depletion(inspection, [each for each in watchers if each.steps])
+    if remark := remark_on_lost_values([each.lost for each in watchers[: len(results)]]):
+        inspection.add("warning", "depletion", f"with random sensing, {remark}", f"{REMEDY}.")
+    _report_depletion(inspection, [each for each in watchers if each.steps], remark)
     states = [step.before for watcher in watchers for step in watcher.steps]
     kept = [states[index] for index in spread_out(_BELIEFS, len(states))]
     for state in kept:
@@ -347,7 +344,7 @@ def _report_endings(inspection: Inspection, results: list[TrialResult], steps: i
     inspection.add("warning", "trials", seen, advice)
 
 
-def _report_depletion(inspection: Inspection, trials: list[_Watcher]) -> None:
+def _report_depletion(inspection: Inspection, trials: list[_Watcher], lost: str) -> None:
     """Report what observations leave of the particles, and how often the truth is beyond them."""
     if not trials:
         return
@@ -379,7 +376,7 @@ def _report_depletion(inspection: Inspection, trials: list[_Watcher]) -> None:
         seen += f"random sensing, the true state lies beyond all {particles} particles in some "
         seen += f"coordinate, most often in {inspection.coordinate(at)} ({shares[at]:.0%})"
         advice = "An observation leaves few for other coordinates: take more, or sense more often."
-        if not attributes.static_parameters(inspection.problem):
+        if not lost and not attributes.static_parameters(inspection.problem):
             advice += " Name continuous values that never change in static_parameters."
         inspection.add("warning", "depletion", seen, advice)
 

@@ -29,8 +29,10 @@ from holdfast.errors import InvalidValueError, TrialCrashError, TrialError, Work
 from holdfast.journal.fingerprint import fingerprint
 from holdfast.numerics.arrays import FloatArray, real_number, whole
 from holdfast.printable import brief
+from holdfast.robot.lost_values import remark_on_lost_values
 from holdfast.robot.trial_pool import Arm, TrialPool
 from holdfast.runtime.command_line import MAX_JOBS
+from holdfast.runtime.files import shown_path
 from holdfast.runtime.machine import available_cores
 from holdfast.runtime.ray_workers import RayCluster
 from holdfast.tuning.candidates import (
@@ -52,7 +54,7 @@ from holdfast.tuning.kept_trials import FRESH, TRIALS_NAME, KeptTrials, TrialRow
 from holdfast.tuning.race import PILOT_TRIALS, MeasuredTrial, Standing, race
 from holdfast.tuning.tuning_report import CandidateRow, Tuning, write_report
 from holdfast.tuning.verdict import MUCH_SLOWER, cost_of, judge, mean_difference
-from holdfast.validation import as_function, as_path
+from holdfast.validation import as_function, as_path, close_match
 
 _SHARE_OF_THE_RACE = 0.6
 _LEAST_FRESH = 20
@@ -131,7 +133,7 @@ def tune(
         configuration = load(as_path("configuration", configuration))
     for each in vary if isinstance(vary, list | tuple) else [vary]:
         if not isinstance(each, str) or each not in VARIATIONS:
-            allowed = ", ".join(VARIATIONS)
+            allowed = ", ".join(VARIATIONS) + close_match(str(each), VARIATIONS)
             raise InvalidValueError(f"vary has {brief(each)}; allowed are {allowed}")
     as_function("on_progress", on_progress)
     most = whole("most", most, 2, FRESH - 1)
@@ -238,6 +240,13 @@ class _Tuner:
             rows, finalists, self.objective, self._limit, barred, min(most, _LEAST_FRESH)
         )
         sentence = verdict.sentence
+        chosen = (row.lost_values for row in rows[verdict.choice])
+        if lost := remark_on_lost_values([each.split("; ") if each else [] for each in chosen]):
+            particles = 10 * self.base.planning.particle_filter.num_particles
+            sentence += (
+                f" But {lost}. More particles may gain more than any method: holdfast tune "
+                f"{shown_path(self.base.path)} --set particle_filter.num_particles={particles}."
+            )
         left_out |= self._failed
         for name, reason in list(left_out.items())[:_MOST_REFUSED]:
             sentence += f" {name} was left out: {reason.splitlines()[0]}."
@@ -389,6 +398,7 @@ class _Tuner:
                         finished.trial,
                         result.success,
                         result.failed,
+                        "; ".join(finished.lost_values),
                         result.steps,
                         result.reward,
                         float(np.median(result.sensing_ms)) if result.sensing_ms else 0.0,

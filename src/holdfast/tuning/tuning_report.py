@@ -83,7 +83,8 @@ class Tuning(Table, msgspec.Struct, frozen=True, kw_only=True):
         return (
             "The race, from which the winner was chosen, so that its own numbers look too good. A "
             "difference is over the trials of both; what is slow has had fewer. candidates.csv has "
-            "reasons whole."
+            "reasons whole. Steps are arithmetic means; a trial that did not reach the goal counts "
+            "as its limit, simulator.max_steps."
         )
 
 

@@ -1,0 +1,68 @@
+"""Values that a belief has lost, though they were the true ones: of a bit, a colour, a drawer.
+
+Resampling copies particles. Where a sharp observation of one coordinate leaves few, their copies
+have few values of what no noise refreshes, and soon one: the belief is certain by chance and not by
+evidence, and no observation brings the true value back. Evidence alone rarely misleads so: of n
+particles and k values, equally likely at first, the true one's posterior share ever falls to 1/n in
+at most k of n trials (Ville's inequality). Which value is true only a simulated world knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from holdfast.planning.outcome import TrialResult
+from holdfast.planning.planner import PlanningState
+from holdfast.problems.attributes import coordinate_name
+from holdfast.robot.environment import Environment, SimulatedEnvironment
+from holdfast.robot.trial import TrialObserver
+
+REMEDY = (
+    "Resampling loses such a value by chance where observations leave few particles: take more "
+    "(particle_filter.num_particles), declare the sharpest sensors less sharp, or resample less "
+    "often (particle_filter.resampling_threshold: 0.5)"
+)
+
+
+class LostValues(TrialObserver):
+    """Observes trials, and keeps which coordinates have ``lost`` the true value in the last one.
+
+    These are coordinates that have a few values: the true one and others were among those of the
+    particles at first, nothing else is at the end, and then no particle has the true one.
+    """
+
+    lost: tuple[str, ...] = ()
+
+    def trial_began(self, environment: Environment, state: PlanningState) -> None:
+        """Keep the values of the coordinates of which some particles have the true one."""
+        self.world = environment if isinstance(environment, SimulatedEnvironment) else None
+        self.lost, self._values = (), {}
+        if self.world is not None:
+            states = state.belief.states
+            several = (states == self.world.state).any(axis=0) & (states != states[0]).any(axis=0)
+            self._values = {int(at): np.unique(states[:, at]) for at in np.flatnonzero(several)}
+
+    def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
+        """Look which values are left."""
+        del result
+        if self.world is not None:
+            left, true = state.belief.states[state.belief.weights > 0.0], self.world.state
+            self.lost = tuple(
+                coordinate_name(self.world.problem, at)
+                for at, values in self._values.items()
+                if true[at] in values
+                and (left[:, at] != true[at]).all()
+                and np.isin(left[:, at], values).all()
+            )
+
+
+def remark_on_lost_values(trials: Sequence[Sequence[str]]) -> str:
+    """Return how many trials have lost which values; empty if evidence may have misled them."""
+    count = sum(map(bool, trials))
+    if count <= max(1.0, 0.05 * len(trials)):
+        return ""
+    names = ", ".join(sorted({name for lost in trials for name in lost}))
+    ended = f"{count} of {len(trials)} trials ended sure of a wrong value"
+    return f"{ended}: no particle had the true one of {names}"
