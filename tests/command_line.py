@@ -107,8 +107,9 @@ class Workplace:
 
 
 def done_here(directory: Path, *commands: tuple[str, ...]) -> None:
-    """Run commands in a directory, which must succeed, whatever they say."""
+    """Run commands in a directory, which must succeed, whatever they say. They draw no figure."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "matplotlib", None)
         patch.chdir(directory)
         for name, *arguments in commands:
             assert find_command([name, *arguments]).run(arguments) == 0
