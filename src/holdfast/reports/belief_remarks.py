@@ -82,7 +82,7 @@ def _depleted(record: TrialRecord) -> list[tuple[int, int, int]]:
     befores = [step.before.belief.states for step in steps]
     afters = [step.after.belief.states for step in steps]
     for at in range(befores[0].shape[1] if len(steps) > 1 else 0):
-        first, last = (len(np.unique(states[:, at])) for states in (befores[0], befores[-1]))
+        first, last = (len(set(states[:, at].tolist())) for states in (befores[0], befores[-1]))
         varied = 2 * first > len(befores[0])
         if varied and last <= max(1.0, _FEW * first):
             moves = zip(afters, befores[1:], strict=False)
