@@ -1,6 +1,7 @@
 """The command line in the test's own process: for what is decided before anything is started."""
 
 import csv
+import functools
 import importlib
 import json
 import os
@@ -115,6 +116,7 @@ def done_here(directory: Path, *commands: tuple[str, ...]) -> None:
             assert find_command([name, *arguments]).run(arguments) == 0
 
 
+@functools.cache
 def commands() -> dict[str, str]:
     """Return the modules of all commands by name, those of the laboratory as well.
 
