@@ -1,6 +1,7 @@
 """The command line in the test's own process: for what is decided before anything is started."""
 
 import csv
+import functools
 import importlib
 import json
 import os
@@ -107,13 +108,15 @@ class Workplace:
 
 
 def done_here(directory: Path, *commands: tuple[str, ...]) -> None:
-    """Run commands in a directory, which must succeed, whatever they say."""
+    """Run commands in a directory, which must succeed, whatever they say. They draw no figure."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "matplotlib", None)
         patch.chdir(directory)
         for name, *arguments in commands:
             assert find_command([name, *arguments]).run(arguments) == 0
 
 
+@functools.cache
 def commands() -> dict[str, str]:
     """Return the modules of all commands by name, those of the laboratory as well.
 

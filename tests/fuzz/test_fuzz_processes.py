@@ -25,7 +25,7 @@ from holdfast.protocol.messages import SensingAnswer, TaskAnswer, decode_request
 ROOT = Path(__file__).parents[2]
 RUNS = 20_000
 SOAK_S = 75.0
-ATTACK_S = 4.0
+ATTACK_S = 2.0
 
 
 @pytest.mark.slow

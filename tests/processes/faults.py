@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import yaml
+from tests.command_line import done_here
 from tests.ports import free_port
 from tests.process_states import stop
 from tests.processes.world import PATIENCE_S as PATIENCE_S
@@ -441,10 +442,8 @@ class References:
         if text not in self._made:
             path = self._directory / f"reference-{len(self._made)}"
             path.mkdir()
-            with Site(path) as site:
-                file = site.configure(document)
-                ended = site.holdfast("run", file, "--out", path / "out", "--jobs", "1", "-q")
-                assert ended.process.returncode == 0, ended.account()
+            file = Site(path).configure(document).name
+            done_here(path, ("run", file, "--out", "out", "--jobs", "1", "-q"))
             self._made[text] = path / "out"
         return self._made[text]
 

@@ -2,6 +2,7 @@
 
 import io
 import itertools
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ class TestFigure:
     def test_twelve_sensing_actions_have_room(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.syspath_prepend(EXAMPLES)
+        shutil.copy(EXAMPLES / "light_dark_room.py", tmp_path)
         (tmp_path / "twelve.py").write_text(TWELVE)
         (tmp_path / "twelve.yaml").write_text(
             "problem: twelve:Twelve\nsimulator: {max_steps: 60, sensing_intervals: 2}\n"

@@ -1,11 +1,10 @@
 """Where a run is shown, and what is said where it cannot be."""
 
-from importlib.metadata import PackageNotFoundError
+import importlib.metadata
 
 import pytest
 
 from holdfast.errors import InvalidValueError, ViewError
-from holdfast.reports import view_target
 from holdfast.reports.view_target import ViewTarget, require_rerun, viewer_url
 
 
@@ -44,9 +43,9 @@ def test_without_a_display_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -
 
 def test_without_rerun_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     def lacking(name: str) -> str:
-        raise PackageNotFoundError(name)
+        raise importlib.metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr(view_target, "version", lacking)
+    monkeypatch.setattr(importlib.metadata, "version", lacking)
     with pytest.raises(ViewError, match=r"pip install 'holdfast-sensing\[view\]'"):
         require_rerun(ViewTarget(None, "run.rrd"))
     monkeypatch.setenv("HOLDFAST_INSTALL", "build with {}")  # as an image says it

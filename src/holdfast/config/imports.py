@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -57,26 +58,20 @@ def _imported_by(path: Path, name: str, *, places: bool) -> list[tuple[str, bool
         tree = ast.parse(path.read_bytes())
     except (SyntaxError, ValueError):
         return []  # it was never imported
-    functions = [
-        node
-        for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
-    ]
-    later = {node for function in functions for node in ast.walk(function)}
-    for_types = {
-        node
-        for choice in ast.walk(tree)
-        if isinstance(choice, ast.If) and ast.unparse(choice.test).endswith("TYPE_CHECKING")
-        for statement in choice.body
-        for node in ast.walk(statement)
-        if not ast.unparse(choice.test).startswith("not ")
-    }
-    return [
-        (module, node not in later)
-        for node in ast.walk(tree)
-        if node not in for_types
-        for module in _imported_in(node, path, name, places=places)
-    ]
+    names: list[tuple[str, bool]] = []
+    waiting: deque[tuple[ast.AST, bool]] = deque([(tree, True)])
+    while waiting:
+        node, at_once = waiting.popleft()
+        names += [(module, at_once) for module in _imported_in(node, path, name, places=places)]
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            at_once = False
+        inside = ast.iter_child_nodes(node)
+        if isinstance(node, ast.If):
+            test = ast.unparse(node.test)
+            if test.endswith("TYPE_CHECKING") and not test.startswith("not "):
+                inside = iter([node.test, *node.orelse])
+        waiting.extend((each, at_once) for each in inside)
+    return names
 
 
 def _imported_in(node: ast.AST, path: Path, name: str, *, places: bool) -> list[str]:

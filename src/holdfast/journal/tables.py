@@ -157,7 +157,10 @@ class SummaryBuilder:
         counts: dict[str, Any] = {name: sums[name] for name in COUNTS}
         median = p99 = None
         if self._sensing_ms:
-            quantiles = np.quantile(np.frombuffer(self._sensing_ms, dtype=np.float32), [0.5, 0.99])
+            # As np.quantile, which imports NumPy's masked arrays.
+            times = np.sort(np.frombuffer(self._sensing_ms, dtype=np.float32))
+            at = np.array([0.5, 0.99]) * (len(times) - 1)
+            quantiles = np.interp(at, np.arange(len(times)), times)
             median, p99 = (round(float(quantile), 4) for quantile in quantiles)
         return RunSummary(
             problem=problem,

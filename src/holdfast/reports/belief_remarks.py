@@ -102,7 +102,7 @@ def _depleted(record: TrialRecord) -> list[tuple[int, int, int]]:
     befores = [step.before.belief.states for step in steps]
     afters = [step.after.belief.states for step in steps]
     for at in range(befores[0].shape[1] if len(steps) > 1 else 0):
-        first, last = (len(np.unique(states[:, at])) for states in (befores[0], befores[-1]))
+        first, last = (len(set(states[:, at].tolist())) for states in (befores[0], befores[-1]))
         moves = zip(afters, befores[1:], strict=False)
         if last > max(1.0, _FEW * first) or not all(
             np.array_equal(one[:, at], two[:, at]) for one, two in moves

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
 from holdfast.errors import InvalidValueError, ViewError, how_to_install
@@ -45,9 +44,11 @@ def require_rerun(target: ViewTarget) -> None:
     Raises ViewError if Rerun is not installed, or a viewer would have to be started without a
     display.
     """
+    from importlib import metadata
+
     try:
-        version("rerun-sdk")
-    except PackageNotFoundError as error:
+        metadata.version("rerun-sdk")
+    except metadata.PackageNotFoundError as error:
         advice = how_to_install("rerun-sdk", "view")
         raise ViewError(f"a view needs Rerun, which is not installed: {advice}") from error
     if target.viewer == "" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):

@@ -42,7 +42,7 @@ class LostValues(TrialObserver):
         if self.world is not None:
             states = state.belief.states
             several = (states == self.world.state).any(axis=0) & (states != states[0]).any(axis=0)
-            self._values = {int(at): np.unique(states[:, at]) for at in np.flatnonzero(several)}
+            self._values = {int(at): set(states[:, at].tolist()) for at in np.flatnonzero(several)}
 
     def trial_ended(self, state: PlanningState, result: TrialResult) -> None:
         """Look which values are left."""
@@ -54,7 +54,7 @@ class LostValues(TrialObserver):
                 for at, values in self._values.items()
                 if true[at] in values
                 and (left[:, at] != true[at]).all()
-                and np.isin(left[:, at], values).all()
+                and values.issuperset(left[:, at].tolist())
             )
 
 
