@@ -72,6 +72,8 @@ class Configuration:
         ``tls`` is an absolute path.
     environment : EnvironmentSettings
         ``directory`` is where its module was found; None for one that is installed.
+    given, overrides : mapping
+        The values of each section in the file or instead of it; those instead, by ``section.key``.
     """
 
     problem: Problem = field(compare=False, repr=False)
@@ -87,6 +89,8 @@ class Configuration:
     recovery: RecoverySettings = field(default_factory=RecoverySettings)
     lost: LostSettings = field(default_factory=LostSettings)
     environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
+    given: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    overrides: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def to_yaml(self) -> str:
         """Return the resolved configuration as a file that loads to an equal configuration.
@@ -253,6 +257,8 @@ def _build(
         recovery=recovery,
         lost=lost,
         environment=environment,
+        given=source.sections,
+        overrides={**({"problem": problem_name} if problem_name else {}), **overrides},
     )
 
 
