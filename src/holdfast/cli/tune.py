@@ -63,7 +63,7 @@ class TuneOptions(command_line.Options):
     Methods and settings race in the same simulated worlds; what is beaten is dropped. The winner is
     then judged beside CONFIG and random sensing on trials that had no part in the race.
 
-    DIR gets tuned.yaml (CONFIG with the keys that changed), tune.md (tables with intervals),
+    DIR gets tuned.yaml (CONFIG, --set, and the keys that changed), tune.md (tables with intervals),
     tune.png, candidates.csv and trials.csv.
     """
 

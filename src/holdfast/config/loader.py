@@ -73,7 +73,7 @@ class Configuration:
     environment : EnvironmentSettings
         ``directory`` is where its module was found; None for one that is installed.
     given, overrides : mapping
-        The values of each section in the file or instead of it; those instead, by ``section.key``.
+        The keys of each section that are not left out; values instead of the file's, by key.
     """
 
     problem: Problem = field(compare=False, repr=False)
@@ -219,6 +219,7 @@ def _build(
     offload = _checked_offload(source, source.section("offload", OffloadSettings), recovery)
     lost = source.section("lost", LostSettings)
     environment = _located_environment(source, source.section("environment", EnvironmentSettings))
+    given = {section: tuple(keys) for section, keys in source.sections.items()}
     built = build_from(source, name, problem_class)
 
     of_states = selector.method == "state_entropy"
@@ -257,7 +258,7 @@ def _build(
         recovery=recovery,
         lost=lost,
         environment=environment,
-        given=source.sections,
+        given=given,
         overrides={**({"problem": problem_name} if problem_name else {}), **overrides},
     )
 

@@ -65,7 +65,6 @@ _JUDGED_ANYWAY = (AS_CONFIGURED, RANDOM)
 _PATIENCE_S = 10.0  # no trial is ended sooner while there is time
 _FAR_LONGER = 10.0  # times the longest possible trial, by the seconds per step seen so far
 _FIRST_SHARE = 0.1  # of the budget: a first trial that takes longer leaves no time for ten
-_FINALIST = "a finalist"
 _MOST_REFUSED = 4  # of those that could not be tried, the sentence names so many
 
 
@@ -132,7 +131,8 @@ def tune(
         If trials of the configuration itself fail, end their process, or do not end.
     """
     if not isinstance(configuration, Configuration):
-        configuration = load(as_path("configuration", configuration, " or a Configuration"))
+        kind = "a path, or what load_configuration returns"
+        configuration = load(as_path("configuration", configuration, kind))
     for each in vary if isinstance(vary, list | tuple) else [vary]:
         if not isinstance(each, str) or each not in VARIATIONS:
             allowed = ", ".join(VARIATIONS) + close_match(str(each), VARIATIONS)
@@ -243,11 +243,12 @@ class _Tuner:
         if lost := remark_on_lost_values([each.split("; ") if each else [] for each in chosen]):
             particles = 10 * self.base.planning.particle_filter.num_particles
             again = _words(self.base, {"particle_filter.num_particles": particles})
-            sentence += f" But {lost}. More particles may gain more than any method: {again}."
+            sentence += f" But {lost}. More particles may gain more than any method: "
+            sentence += f"holdfast tune {again}."
         if self.base.overrides:
-            sentence += f" Your configuration is here that of {_words(self.base)}."
+            sentence += f" Your configuration, here, is {_words(self.base)}."
         if "fixed" not in vary and len(self.base.problem.sensing_actions) > 1:
-            fixed = f"{_words(self.base)} --vary methods,fixed"
+            fixed = f"holdfast tune {_words(self.base)} --vary methods,fixed"
             sentence += f" Always the same sensing action was not tried: {fixed} does that."
         left_out |= self._failed
         for name, reason in list(left_out.items())[:_MOST_REFUSED]:
@@ -307,7 +308,7 @@ class _Tuner:
     def _finalists(self, standings: Sequence[Standing]) -> list[str]:
         """Return the winner, and one that may be as good, two if the winner is judged anyway."""
         winner = standings[0].candidate
-        costs, equals, self._notes = self._costs(winner), [], {winner: _FINALIST}
+        costs, equals, self._notes = self._costs(winner), [], {}
         for each in standings[1:]:
             own = self._costs(each.candidate)
             common = min(len(own), len(costs))
@@ -317,10 +318,8 @@ class _Tuner:
             self._notes[each.candidate] = "not judged, the winner leads in common trials"
             if np.mean(differences) <= 2.0 * np.std(differences, ddof=1) / math.sqrt(common):
                 equals.append(each.candidate)
-        if not equals:
-            return [winner]
-        bound_ms = self._decision_ms(winner) / MUCH_SLOWER
-        quick = [name for name in equals if self._decision_ms(name) <= bound_ms]
+        taken_ms = {name: self._decision_ms(name) for name in (winner, *equals) if equals}
+        quick = [name for name in equals if MUCH_SLOWER * taken_ms[name] <= taken_ms[winner]]
         each_s = {each.candidate: each.seconds for each in standings}
         found = [winner]
         for name in dict.fromkeys([*quick[:1], *equals]):
@@ -330,7 +329,7 @@ class _Tuner:
             self._notes[name] = f"not judged, {'for lack of time' if has_room else 'as others are'}"
             if has_room and needed_s <= self.jobs * (self._budget_s - self._spent_s()):
                 found.append(name)
-                self._notes[name] = _FINALIST
+        self._notes |= dict.fromkeys(found, "a finalist")
         return found
 
     def _add(self, candidate: Candidate) -> None:
@@ -480,8 +479,8 @@ class _Tuner:
 
 
 def _words(base: Configuration, more: Mapping[str, Any] | None = None) -> str:
-    """Return the command that tunes it, with what was given instead of the file's values."""
-    words = ["holdfast", "tune", shown_path(base.path)]
+    """Return the words for a configuration, with what was given instead of the file's values."""
+    words = [shown_path(base.path)]
     for key, value in {**base.overrides, **(more or {})}.items():
         text = msgspec.json.encode(value).decode()
         words += ["--problem", value] if key == "problem" else ["--set", f"{key}={text}"]

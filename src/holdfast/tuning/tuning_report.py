@@ -126,8 +126,7 @@ def write_report(out: Path, configuration: Configuration, found: Tuning) -> None
 def tuned_yaml(configuration: Configuration, found: Tuning) -> str:
     """Return what was tuned, as a file, with the keys that changed, and what they were.
 
-    It has the keys of the user's file, and what is not by default: overrides are in force, too.
-    Paths are absolute, because it lies in another directory.
+    It has the keys that were given, and what is not by default; its paths are absolute.
     """
     resolved = configuration.plain()["configuration"]
     data = {key: resolved[key] for key in ("problem", "problem_directory") if key in resolved}
