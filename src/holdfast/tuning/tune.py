@@ -247,7 +247,8 @@ class _Tuner:
             sentence += f"holdfast tune {again}."
         if self.base.overrides:
             sentence += f" Your configuration, here, is {_words(self.base)}."
-        if "fixed" not in vary and len(self.base.problem.sensing_actions) > 1:
+        several = len(self.base.problem.sensing_actions) > 1
+        if several and "fixed" not in (*vary, self.base.planning.selector.method):
             fixed = f"holdfast tune {_words(self.base)} --vary methods,fixed"
             sentence += f" Always the same sensing action was not tried: {fixed} does that."
         left_out |= self._failed
@@ -285,15 +286,13 @@ class _Tuner:
         names = [each.name for each in candidates]
         self._doing = f"{len(names)} candidates race"
         self._until_s = until_s * _AT_MOST_OF_THE_RACE / _SHARE_OF_THE_RACE
-        before_s = self._seconds(
-            key for key in self.kept.rows if key[0] in names and key[1] < FRESH
-        )
+        raced = [key for key in self.kept.rows if key[0] in names and key[1] < FRESH]
         standings = race(
             names,
             self._measured,
             limit={"steps": float(self._limit), "success": 1.0}.get(self.objective),
             most=most,
-            budget_s=self.jobs * (until_s - self._spent_s() + before_s),
+            budget_s=self.jobs * (until_s - self._spent_s() + self._seconds(raced)),
             refuse=self._refusal,
         )
         if standings[0].state == "refused":
