@@ -208,14 +208,14 @@ def close_match(text: str, allowed: Iterable[str]) -> str:
     return did_you_mean(text.lower(), texts, sure=close if len(close) == 2 else ())
 
 
-def as_path(what: str, value: Any) -> Path:
-    """Return a path; otherwise InvalidValueError names ``what``."""
+def as_path(what: str, value: Any, kind: str = "a path") -> Path:
+    """Return a path; otherwise InvalidValueError names ``what`` and the ``kind``."""
     try:
         path = Path(value)
     except TypeError:
         path = Path()
     if str(value) in ("", "\0") or not isinstance(value, str | Path) or "\0" in str(path):
-        raise InvalidValueError(f"{what} is {brief(value)}; it must be a path")
+        raise InvalidValueError(f"{what} is {brief(value)}; it must be {kind}")
     return path
 
 

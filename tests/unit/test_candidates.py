@@ -1,6 +1,7 @@
 """What a tuning tries of a configuration."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import get_args
 
 import pytest
@@ -82,10 +83,8 @@ def test_a_configuration_that_is_random_is_not_tried_twice(tmp_path: Path) -> No
 
 def test_names_tell_sensing_actions_apart(tmp_path: Path) -> None:
     (tmp_path / "alike.py").write_text(ALIKE)
-    base = written(tmp_path, "").plain()
-    base["configuration"] |= {"problem": "alike:Alike", "problem_directory": str(tmp_path)}
-    base["configuration"]["model"] = base["configuration"]["state_space_planner"] = {}
-    found = by_name(first_candidates(Configuration.from_plain(base), ["fixed"], "steps")[0])
+    (tmp_path / "run.yaml").write_text("problem: alike:Alike\n")
+    found = by_name(first_candidates(load(tmp_path / "run.yaml"), ["fixed"], "steps")[0])
     actions = {name: each.changes.get("selector.sensing_action") for name, each in found.items()}
     assert actions["always look (0)"] in (0, None)
     assert actions["always look (2)"] == 2
@@ -122,12 +121,6 @@ def test_intervals_and_particles_of_the_winner(
 
 
 def test_rewards() -> None:
-    class Bare:
-        pass
-
-    class Priced:
-        sensing_costs = (1.0,)
-
     assert has_rewards(CapsuleRobot())
-    assert has_rewards(Priced())
-    assert not has_rewards(Bare())
+    assert has_rewards(SimpleNamespace(sensing_costs=(1.0,)))
+    assert not has_rewards(SimpleNamespace())

@@ -9,6 +9,7 @@ from tests.unit.test_tuning_tune import RUN
 
 from holdfast.errors import WorkerDiedError
 from holdfast.tuning import tune as tuning
+from holdfast.tuning.findings import Finding
 
 WORDS = ("tune", "run.yaml", "--vary", "fixed", "--trials", "20", "-j", "1", "--no-check")
 
@@ -19,13 +20,20 @@ def here(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_it_says_what_to_do(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = run_here(capsys, here, *WORDS)
+@pytest.mark.parametrize("given", [(), ("--set", "particle_filter.num_particles=31")])
+def test_it_says_what_to_do(
+    here: Path, capsys: pytest.CaptureFixture[str], given: tuple[str, ...]
+) -> None:
+    said = run_here(capsys, here, *WORDS, *given)
     assert said.code == 0, said.stderr
     assert (here / "runs/run-tuned/tune.md").read_text() == said.stdout
-    assert "Take it" not in said.stderr  # nothing is to be changed
+    # Without it nothing is to be changed.
+    kept = (here / "runs/run-tuned/tuned.yaml").read_text()
+    assert ("num_particles: 31" in kept) == bool(given)
+    assert ("Take it: holdfast run runs/run-tuned/tuned.yaml" in said.stderr) == bool(given)
     assert not (here / "runs/run-tuned/tune.png").exists()  # no matplotlib here
-    again = run_here(capsys, here, *WORDS, "--resume", "--out", "runs/run-tuned", "-q")
+    more = ("--resume", "--out", "runs/run-tuned", "-q")
+    again = run_here(capsys, here, *WORDS, *given, *more)
     assert again.stdout == said.stdout.splitlines(keepends=True)[0]
 
 
@@ -50,8 +58,13 @@ def test_after_a_killed_worker_it_can_go_on(
         on_progress(tuning.Progress(0.1, 1, "5 candidates race"))
         raise WorkerDiedError("a worker process was killed")
 
+    def warned(_: Any, __: float, warn: Any, check: str) -> None:
+        warn(Finding("warning", "units", "an angle is in degrees", "Use radians."))
+
     monkeypatch.setattr(tuning, "tune", killed)
-    said = run_here(capsys, here, *WORDS, "--out", "mine")
+    monkeypatch.setattr("holdfast.tuning.check_process.require_right", warned)
+    said = run_here(capsys, here, *WORDS[:-1], "--out", "mine")
+    assert said.stderr.startswith("note: units: an angle is in degrees -> Use radians.\n")
     assert said.code == 4
     assert "holdfast: error: a worker process was killed\nGo on with: holdfast tune" in said.stderr
     assert said.stderr.endswith(" --out mine --resume\n")

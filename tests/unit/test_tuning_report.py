@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from holdfast.config.loader import load
@@ -17,6 +18,18 @@ from holdfast.tuning.tuning_report import (
 from holdfast.tuning.verdict import Comparison
 
 CHANGES = {"selector.method": "state_entropy", "selector.resolution": [0.3, 0.3, 0.1]}
+SUCCESS = Comparison(
+    candidate="state_entropy",
+    against="random",
+    measure="success",
+    value=0.9,
+    other=0.5,
+    difference=0.4,
+    interval=(0.3, 0.5),
+)
+STEPS = msgspec.structs.replace(
+    SUCCESS, measure="steps", value=41.0, other=40.0, difference=1.0, interval=(-1.0, 3.0)
+)
 FOUND = Tuning(
     sentence="Sense by state_entropy: 41 steps.",
     choice="state_entropy",
@@ -24,26 +37,7 @@ FOUND = Tuning(
     matters=True,
     objective="steps",
     fresh_trials=80,
-    comparisons=(
-        Comparison(
-            candidate="state_entropy",
-            against="random",
-            measure="success",
-            value=0.9,
-            other=0.5,
-            difference=0.4,
-            interval=(0.3, 0.5),
-        ),
-        Comparison(
-            candidate="state_entropy",
-            against="random",
-            measure="steps",
-            value=41.0,
-            other=40.0,
-            difference=1.0,
-            interval=(-1.0, 3.0),
-        ),
-    ),
+    comparisons=(SUCCESS, STEPS),
     candidates=(
         CandidateRow(
             candidate="state_entropy",
@@ -67,7 +61,8 @@ def test_the_configuration_with_the_keys_that_changed(tmp_path: Path) -> None:
     path = tmp_path / "mine" / "run.yaml"
     (path.parent / "room.py").write_text("from tests.line_problem import Line\n")
     path.write_text("problem: room:Line\nselector: {sensing_action: 1}\noffload: {tls: keys}\n")
-    base = load(path)
+    given = {"particle_filter.num_particles": 40, "simulator.seed": 5, "selector.resolution": 0.2}
+    base = load(path, overrides=given)
     found = tuned_yaml(base, FOUND)
     # From another directory, the module and the credentials are found.
     expected = changed(base, {"selector.method": "state_entropy", "selector.resolution": 0.1})
@@ -75,8 +70,8 @@ def test_the_configuration_with_the_keys_that_changed(tmp_path: Path) -> None:
     (tmp_path / "tuned.yaml").write_text(one)
     assert load(tmp_path / "tuned.yaml") == expected
     assert "# Sense by state_entropy: 41 steps.\n" in found
-    assert '# selector.method was "path_entropy".\n# selector.resolution was null.\n' in found
-    assert "particle_filter" not in found
+    assert '# selector.method was "path_entropy".\n# selector.resolution was 0.2.\n' in found
+    assert "active_sensing" not in found
 
 
 def test_tables(tmp_path: Path) -> None:

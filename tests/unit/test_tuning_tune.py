@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.config.loader import load
+from holdfast.config.loader import Configuration, load
 from holdfast.errors import InvalidValueError, WorkerDiedError
 from holdfast.tuning.candidates import AS_CONFIGURED, RANDOM
 from holdfast.tuning.kept_trials import FRESH
@@ -29,8 +29,8 @@ def run(tmp_path: Path) -> Path:
     return path
 
 
-def tuned(path: Path, **more: Any) -> Any:
-    return hf.tune(path, **{"vary": ["fixed"], "most": 6, "jobs": 1, "check": False, **more})
+def tuned(run: Path | Configuration, **more: Any) -> Any:
+    return hf.tune(run, **{"vary": ["fixed"], "most": 6, "jobs": 1, "check": False, **more})
 
 
 def test_what_it_finds_and_writes(run: Path) -> None:
@@ -95,9 +95,11 @@ def test_the_configuration_itself_dies_or_hangs(
 
 def test_it_says_that_particles_are_too_few(run: Path) -> None:
     (run.parent / "bits.py").write_text("from tests.unit.test_lost_values import Bit\n")
-    run.write_text(RUN.replace("peg_in_hole_2d", "bits:Bit"))
-    found = tuned(run, vary=["fixed"], most=20)
-    more = f"tune {run} --set particle_filter.num_particles=300."
+    base = load(run, problem="bits:Bit", overrides={"simulator.max_steps": 20})
+    found = tuned(base, vary=["fixed"], most=20)
+    given = f"{run} --problem bits:Bit --set simulator.max_steps=20"
+    assert f" Your configuration, here, is {given}." in found.sentence
+    more = f"tune {given} --set particle_filter.num_particles=300."
     assert re.search(rf" But \d+ of 40 trials ended sure of a wrong .* {more}", found.sentence)
 
 
@@ -126,7 +128,10 @@ class Mean(Line):
 """
 
 
-def test_no_trial_begins_when_time_is_up(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("last", "why"), [(60, "for lack of time"), (1000, "as others are")])
+def test_no_trial_begins_when_time_is_up(
+    run: Path, monkeypatch: pytest.MonkeyPatch, last: int, why: str
+) -> None:
     now_s = 0.0
     monkeypatch.setattr("holdfast.tuning.tune.monotonic", lambda: now_s)
     judging: list[int] = []
@@ -135,12 +140,17 @@ def test_no_trial_begins_when_time_is_up(run: Path, monkeypatch: pytest.MonkeyPa
         nonlocal now_s
         if progress.doing.endswith("judged on fresh trials"):
             judging.append(progress.trials)
+        if judging or progress.trials == last:
             now_s = 601.0
 
     found = tuned(run, most=20, on_progress=shows)
     assert found.sentence.startswith("The budget was too short to judge: ")
     assert len(judging) <= 20  # what the worker had
     assert not found.changes and not found.comparisons
+    states = {each.candidate: each.state for each in found.candidates}
+    assert states["always θ"] == f"in the race: not judged, {why}"
+    note = " 3 more candidates were neither beaten nor judged: a larger budget goes on (--resume;"
+    assert (note in found.sentence) == (last == 60)
 
 
 def test_slow_decisions_are_not_admitted(run: Path) -> None:
@@ -150,6 +160,7 @@ def test_slow_decisions_are_not_admitted(run: Path) -> None:
 
 def test_intervals_are_judged_beside_random_sensing_at_the_same(run: Path) -> None:
     found = tuned(run, vary=["interval"], most=20)
+    assert f" not tried: holdfast tune {run} --vary methods,fixed does that." in found.sentence
     (winner, *_) = found.candidates
     assert {each.candidate for each in found.candidates} > {AS_CONFIGURED, RANDOM}
     if "simulator.sensing_intervals" in winner.changes:
@@ -189,9 +200,7 @@ def test_what_is_refused(run: Path) -> None:
         tuned(run, vary=["method"])
     for name, value, words in (
         ("most", 1, "most 1: allowed are whole numbers from 2 "),
-        ("most", 2.5, "most 2.5: allowed are whole numbers from 2 "),
         ("jobs", 0, "jobs 0: allowed are whole numbers from 1 "),
-        ("jobs", 2.5, "jobs 2.5: allowed are whole numbers from 1 "),
         ("budget_s", math.nan, "budget_s is nan; it must be a number above 0"),
         ("budget_s", "600", "budget_s is '600'; it must be a number above 0"),
         ("max_decision_ms", math.nan, "max_decision_ms is nan; it must be a number above 0"),
@@ -199,15 +208,9 @@ def test_what_is_refused(run: Path) -> None:
     ):
         with pytest.raises(InvalidValueError, match=words):
             tuned(run, **{name: value})
-    (run.parent / "bare.py").write_text(BARE)
-    run.write_text(RUN.replace("peg_in_hole_2d", "bare:Bare"))
-    with pytest.raises(InvalidValueError, match=r"bare:Bare has neither rewards nor sensing_costs"):
+    with pytest.raises(InvalidValueError, match="is 3; it must be a path, or what load_"):
+        hf.tune(3)  # type: ignore[arg-type]
+    (run.parent / "bare.py").write_text("from tests.line_problem import Line\n")
+    run.write_text(RUN.replace("peg_in_hole_2d", "bare:Line"))
+    with pytest.raises(InvalidValueError, match=r"bare:Line has neither rewards nor sensing_costs"):
         tuned(run, objective="reward")
-
-
-BARE = """
-from tests.line_problem import Line
-
-class Bare(Line):
-    pass
-"""

@@ -49,15 +49,12 @@ def test_a_winner_that_is_better() -> None:
     assert "within noise" not in found.sentence
 
 
-def test_a_winner_that_was_only_lucky() -> None:
+def test_a_winner_of_the_race_that_others_beat() -> None:
     found = judge(trials_of(0.0, 20.0, lucky=3.0), ["lucky"], "steps", LIMIT)
     assert found.choice == AS_CONFIGURED
     assert found.sentence.startswith("Keep your configuration: ")
-
-
-def test_random_where_it_is_best() -> None:
-    trials = trials_of(30.0, 0.0, path=20.0)
-    assert judge(trials, ["path"], "steps", LIMIT).sentence.startswith("Sense at random: ")
+    found = judge(trials_of(30.0, 0.0, path=20.0), ["path"], "steps", LIMIT)
+    assert found.sentence.startswith("Sense at random: ")
 
 
 def test_no_trial_succeeds() -> None:
@@ -141,11 +138,8 @@ def test_a_slow_one_does_not_hide_that_random_sensing_is_better() -> None:
     assert found.sentence.startswith("Sense at random: ")
 
 
-def test_a_finalist_that_failed_afterwards_is_not_chosen() -> None:
+def test_who_is_barred_or_failed_afterwards_is_not_chosen() -> None:
     assert judge(trials_of(0.0, 0.0), ["gone"], "steps", LIMIT, {AS_CONFIGURED}).choice == RANDOM
-
-
-def test_who_is_barred_is_not_chosen() -> None:
     trials = {AS_CONFIGURED: rows(AS_CONFIGURED, 0.0), "other": rows("other", 0.0)}
     found = judge(trials, ["other"], "steps", LIMIT, {AS_CONFIGURED})
     assert found.choice == "other"

@@ -63,7 +63,7 @@ class TuneOptions(command_line.Options):
     Methods and settings race in the same simulated worlds; what is beaten is dropped. The winner is
     then judged beside CONFIG and random sensing on trials that had no part in the race.
 
-    DIR gets tuned.yaml (CONFIG with the keys that changed), tune.md (tables with intervals),
+    DIR gets tuned.yaml (CONFIG, --set, and the keys that changed), tune.md (tables with intervals),
     tune.png, candidates.csv and trials.csv.
     """
 
@@ -138,7 +138,7 @@ def main(arguments: Sequence[str]) -> int:
 
     def warn(found: Finding) -> None:
         if not options.quiet:
-            sys.stderr.write(printable(f"note: {found.check}: {found.seen}\n"))
+            sys.stderr.write(printable(f"note: {found.check}: {found.seen} -> {found.advice}\n"))
 
     runs, began_s, budget_s = Path("runs").absolute(), monotonic(), _seconds(options.budget)
     given = combined(overrides_of(options, options.assignments))
@@ -196,6 +196,6 @@ def main(arguments: Sequence[str]) -> int:
         line.stop()
     text = f"{found.sentence}\n" if options.quiet else tuning_tables(found)
     sys.stdout.write(printable(text))
-    if found.changes and not options.quiet:
+    if (found.changes or configuration.overrides) and not options.quiet:
         sys.stderr.write(f"Take it: holdfast run {shown_path(out / CONFIGURATION_NAME)}\n")
     return 0

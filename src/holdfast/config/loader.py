@@ -72,6 +72,8 @@ class Configuration:
         ``tls`` is an absolute path.
     environment : EnvironmentSettings
         ``directory`` is where its module was found; None for one that is installed.
+    given, overrides : mapping
+        The keys of each section that are not left out; values instead of the file's, by key.
     """
 
     problem: Problem = field(compare=False, repr=False)
@@ -87,6 +89,8 @@ class Configuration:
     recovery: RecoverySettings = field(default_factory=RecoverySettings)
     lost: LostSettings = field(default_factory=LostSettings)
     environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
+    given: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    overrides: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def to_yaml(self) -> str:
         """Return the resolved configuration as a file that loads to an equal configuration.
@@ -215,6 +219,7 @@ def _build(
     offload = _checked_offload(source, source.section("offload", OffloadSettings), recovery)
     lost = source.section("lost", LostSettings)
     environment = _located_environment(source, source.section("environment", EnvironmentSettings))
+    given = {section: tuple(keys) for section, keys in source.sections.items()}
     built = build_from(source, name, problem_class)
 
     of_states = selector.method == "state_entropy"
@@ -253,6 +258,8 @@ def _build(
         recovery=recovery,
         lost=lost,
         environment=environment,
+        given=given,
+        overrides={**({"problem": problem_name} if problem_name else {}), **overrides},
     )
 
 

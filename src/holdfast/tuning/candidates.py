@@ -167,8 +167,7 @@ def _later(winner: Candidate, variations: Sequence[Variation]) -> _Changes:
         interval = planning.sensing_interval
         for other in sorted({0, interval // 2, 2 * interval + 1} - {interval}):
             steps = "step" if other == 0 else f"{other + 1} steps"
-            more = {"simulator.sensing_intervals": other}
-            yield f"{winner.name}, every {steps}", now | more
+            yield f"{winner.name}, every {steps}", now | {"simulator.sensing_intervals": other}
     if "particles" in variations:
         particles = planning.particle_filter.num_particles
         for other in sorted({max(1, particles // 3), 3 * particles} - {particles}):

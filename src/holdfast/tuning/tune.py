@@ -16,10 +16,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from time import monotonic
-from typing import NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import msgspec
 import numpy as np
@@ -53,7 +54,7 @@ from holdfast.tuning.check_process import require_right
 from holdfast.tuning.kept_trials import FRESH, TRIALS_NAME, KeptTrials, TrialRow
 from holdfast.tuning.race import PILOT_TRIALS, MeasuredTrial, Standing, race
 from holdfast.tuning.tuning_report import CandidateRow, Tuning, write_report
-from holdfast.tuning.verdict import MUCH_SLOWER, cost_of, judge, mean_difference
+from holdfast.tuning.verdict import GO_ON, MUCH_SLOWER, cost_of, judge, mean_difference
 from holdfast.validation import as_function, as_path, close_match
 
 _SHARE_OF_THE_RACE = 0.6
@@ -130,7 +131,8 @@ def tune(
         If trials of the configuration itself fail, end their process, or do not end.
     """
     if not isinstance(configuration, Configuration):
-        configuration = load(as_path("configuration", configuration))
+        kind = "a path, or what load_configuration returns"
+        configuration = load(as_path("configuration", configuration, kind))
     for each in vary if isinstance(vary, list | tuple) else [vary]:
         if not isinstance(each, str) or each not in VARIATIONS:
             allowed = ", ".join(VARIATIONS) + close_match(str(each), VARIATIONS)
@@ -139,8 +141,7 @@ def tune(
     most = whole("most", most, 2, FRESH - 1)
     jobs = None if jobs is None else whole("jobs", jobs, 1, MAX_JOBS)
     for name, value in (("budget_s", budget_s), ("max_decision_ms", max_decision_ms)):
-        number = real_number(value)
-        if number is None or not number > 0.0:
+        if (number := real_number(value)) is None or not number > 0.0:
             raise InvalidValueError(f"{name} is {brief(value)}; it must be a number above 0")
     if objective not in (None, *get_args(Objective)):
         allowed = ", ".join(get_args(Objective))
@@ -232,36 +233,33 @@ class _Tuner:
             for trial in range(most_fresh + 1)
             if any((name, FRESH + trial) not in self.kept.rows for name in judged)
         )
-        rows = {
-            name: [self.kept.rows[name, FRESH + trial] for trial in range(fresh)] for name in judged
-        }
+        numbers = range(FRESH, FRESH + fresh)
+        rows = {name: [self.kept.rows[name, trial] for trial in numbers] for name in judged}
         barred = {name for name in rows if self._refusal(name) is not None}
-        verdict = judge(
-            rows, finalists, self.objective, self._limit, barred, min(most, _LEAST_FRESH)
-        )
+        least = min(most, _LEAST_FRESH)
+        verdict = judge(rows, finalists, self.objective, self._limit, barred, least)
         sentence = verdict.sentence
         chosen = (row.lost_values for row in rows[verdict.choice])
         if lost := remark_on_lost_values([each.split("; ") if each else [] for each in chosen]):
             particles = 10 * self.base.planning.particle_filter.num_particles
-            sentence += (
-                f" But {lost}. More particles may gain more than any method: holdfast tune "
-                f"{shown_path(self.base.path)} --set particle_filter.num_particles={particles}."
-            )
+            again = _words(self.base, {"particle_filter.num_particles": particles})
+            sentence += f" But {lost}. More particles may gain more than any method: "
+            sentence += f"holdfast tune {again}."
+        if self.base.overrides:
+            sentence += f" Your configuration, here, is {_words(self.base)}."
+        several = len(self.base.problem.sensing_actions) > 1
+        if several and "fixed" not in (*vary, self.base.planning.selector.method):
+            fixed = f"holdfast tune {_words(self.base)} --vary methods,fixed"
+            sentence += f" Always the same sensing action was not tried: {fixed} does that."
         left_out |= self._failed
         for name, reason in list(left_out.items())[:_MOST_REFUSED]:
             sentence += f" {name} was left out: {reason.splitlines()[0]}."
-        if len(left_out) > _MOST_REFUSED:
-            sentence += f" So were {len(left_out) - _MOST_REFUSED} more (the table says why)."
-        untried = sum(
-            each.state == "set aside" and each.trials <= PILOT_TRIALS for each in standings
-        )
-        sentence += _note(untried, "more", "not tried: a larger budget does that")
-        open_ones = sum(
-            each.state == "in the race" and each.candidate not in judged for each in standings
-        )
-        if fresh < most:
-            rest = "not beaten: --resume with a larger budget goes on"
-            sentence += _note(open_ones, "more", rest)
+        few = [each for each in standings if each.trials < most]
+        untried = sum(each.state == "set aside" and each.trials <= PILOT_TRIALS for each in few)
+        unjudged = sum(each.state == "in the race" and each.candidate not in judged for each in few)
+        sentence += _note(len(left_out) - _MOST_REFUSED, "left out, too: the table says why")
+        sentence += _note(untried, "not tried: a larger budget does that")
+        sentence += _note(unjudged, f"neither beaten nor judged: a larger budget {GO_ON}")
         return Tuning(
             sentence=sentence,
             choice=verdict.choice,
@@ -288,15 +286,13 @@ class _Tuner:
         names = [each.name for each in candidates]
         self._doing = f"{len(names)} candidates race"
         self._until_s = until_s * _AT_MOST_OF_THE_RACE / _SHARE_OF_THE_RACE
-        before_s = self._seconds(
-            key for key in self.kept.rows if key[0] in names and key[1] < FRESH
-        )
+        raced = [key for key in self.kept.rows if key[0] in names and key[1] < FRESH]
         standings = race(
             names,
             self._measured,
             limit={"steps": float(self._limit), "success": 1.0}.get(self.objective),
             most=most,
-            budget_s=self.jobs * (until_s - self._spent_s() + before_s),
+            budget_s=self.jobs * (until_s - self._spent_s() + self._seconds(raced)),
             refuse=self._refusal,
         )
         if standings[0].state == "refused":
@@ -311,27 +307,28 @@ class _Tuner:
     def _finalists(self, standings: Sequence[Standing]) -> list[str]:
         """Return the winner, and one that may be as good, two if the winner is judged anyway."""
         winner = standings[0].candidate
-        costs, equals = self._costs(winner), []
+        costs, equals, self._notes = self._costs(winner), [], {}
         for each in standings[1:]:
             own = self._costs(each.candidate)
             common = min(len(own), len(costs))
             if each.state != "in the race" or each.candidate in _JUDGED_ANYWAY or common < 2:
                 continue
             differences = own[:common] - costs[:common]
+            self._notes[each.candidate] = "not judged, the winner leads in common trials"
             if np.mean(differences) <= 2.0 * np.std(differences, ddof=1) / math.sqrt(common):
                 equals.append(each.candidate)
-        if not equals:
-            return [winner]
-        bound_ms = self._decision_ms(winner) / MUCH_SLOWER
-        quick = [name for name in equals if self._decision_ms(name) <= bound_ms]
+        taken_ms = {name: self._decision_ms(name) for name in (winner, *equals) if equals}
+        quick = [name for name in equals if MUCH_SLOWER * taken_ms[name] <= taken_ms[winner]]
         each_s = {each.candidate: each.seconds for each in standings}
         found = [winner]
         for name in dict.fromkeys([*quick[:1], *equals]):
             judged = self._judged([*found, name])
             needed_s = 3 * _LEAST_FRESH * sum(each_s.get(each, 0.0) for each in judged)
             has_room = len(found) < 2 + (winner in _JUDGED_ANYWAY)
+            self._notes[name] = f"not judged, {'for lack of time' if has_room else 'as others are'}"
             if has_room and needed_s <= self.jobs * (self._budget_s - self._spent_s()):
                 found.append(name)
+        self._notes |= dict.fromkeys(found, "a finalist")
         return found
 
     def _add(self, candidate: Candidate) -> None:
@@ -460,7 +457,8 @@ class _Tuner:
     def _row(self, standing: Standing) -> CandidateRow:
         name = standing.candidate
         changes = dict(self._candidates[name].changes) if name in self._candidates else {}
-        state = " ".join(f"{standing.state}{': ' * bool(standing.reason)}{standing.reason}".split())
+        reason = standing.reason or self._notes.get(name, "")
+        state = " ".join(f"{standing.state}{': ' * bool(reason)}{reason}".split())
         rows = self.kept.of(name)[: standing.trials]
         costs, base = self._costs(name)[: len(rows)], self._costs(AS_CONFIGURED)
         common = min(len(costs), len(base))
@@ -479,6 +477,15 @@ class _Tuner:
         )
 
 
-def _note(count: int, kind: str, rest: str) -> str:
+def _words(base: Configuration, more: Mapping[str, Any] | None = None) -> str:
+    """Return the words for a configuration, with what was given instead of the file's values."""
+    words = [shown_path(base.path)]
+    for key, value in {**base.overrides, **(more or {})}.items():
+        text = msgspec.json.encode(value).decode()
+        words += ["--problem", value] if key == "problem" else ["--set", f"{key}={text}"]
+    return shlex.join(words)
+
+
+def _note(count: int, rest: str) -> str:
     what = "candidate was" if count == 1 else "candidates were"
-    return f" {count} {kind} {what} {rest}." if count else ""
+    return f" {count} more {what} {rest}." if count > 0 else ""

@@ -1,12 +1,13 @@
 """What a tuning leaves in its directory: the configuration, tables and a figure.
 
-``tuned.yaml`` is the user's file with the keys that changed, ``tune.md`` says why,
+``tuned.yaml`` is the user's configuration with the keys that changed, ``tune.md`` says why,
 ``candidates.csv`` has the race, ``tune.png`` shows both.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import textwrap
 from collections.abc import Sequence
@@ -16,16 +17,14 @@ from typing import Any
 import msgspec
 
 from holdfast.config.loader import Configuration
-from holdfast.config.yaml_document import read, write
+from holdfast.config.source import SECTIONS, SETTINGS
+from holdfast.config.yaml_document import write
 from holdfast.reports.table_formats import Table
 from holdfast.runtime.files import write_atomically
 from holdfast.tuning.candidates import Objective
 from holdfast.tuning.verdict import FAMILY_LEVEL, Comparison
 
 CONFIGURATION_NAME = "tuned.yaml"
-
-_PATHS = (("offload", "services"), ("offload", "tls"), ("environment", "directory"))
-"""Keys of a file whose values may be relative to it; the result lies in another directory."""
 
 
 class CandidateRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -125,22 +124,23 @@ def write_report(out: Path, configuration: Configuration, found: Tuning) -> None
 
 
 def tuned_yaml(configuration: Configuration, found: Tuning) -> str:
-    """Return the user's configuration file with the keys that changed, and what they were."""
+    """Return what was tuned, as a file, with the keys that changed, and what they were.
+
+    It has the keys that were given, and what is not by default; its paths are absolute.
+    """
     resolved = configuration.plain()["configuration"]
-    try:
-        data: dict[str, Any] = dict(read(configuration.path.read_bytes(), "").data or {})
-    except OSError:
-        data = dict(resolved)  # it came from a pipe
+    data = {key: resolved[key] for key in ("problem", "problem_directory") if key in resolved}
+    for section in SECTIONS:
+        now, given = resolved[section], configuration.given.get(section, ())
+        plain = msgspec.to_builtins(SETTINGS[section]()) if section in SETTINGS else now
+        kept = {key: now[key] for key in now if key in given or now[key] != plain[key]}
+        data |= {section: kept} if kept else {}
     head = [f"# {line}\n" for line in ("By holdfast tune.", found.sentence)]
     for key, value in found.changes.items():
         section, _, name = key.partition(".")
         before = msgspec.json.encode(resolved[section][name]).decode()
         head.append(f"# {key} was {before}.\n")
-        data[section] = {**(data.get(section) or {}), name: value}
-    data |= {key: resolved[key] for key in ("problem", "problem_directory") if key in resolved}
-    for section, name in _PATHS:
-        if name in (data.get(section) or {}):
-            data[section] = {**data[section], name: resolved[section][name]}
+        data[section] = {**data.get(section, {}), name: value}
     return "".join(head) + write(data)
 
 
@@ -195,20 +195,14 @@ def tuning_figure(found: Tuning) -> bytes:
 
     from holdfast.reports.figure import STYLE
 
+    of_race = [each for each in found.candidates if each.interval is not None]
+    in_unit = functools.partial(_in_its_unit, found.objective)
     raced: list[tuple[Any, ...]] = [
-        (
-            each.candidate,
-            *_in_its_unit(found.objective, each.difference or 0.0),
-            _in_its_unit(found.objective, *each.interval),
-        )
-        for each in found.candidates
-        if each.interval is not None
+        (each.candidate, *in_unit(each.difference or 0.0), in_unit(*each.interval or ()))
+        for each in of_race
     ]
-    judged: list[tuple[Any, ...]] = [
-        (each.against, each.difference, each.interval)
-        for each in found.comparisons
-        if each.measure == found.objective
-    ]
+    decisive = [each for each in found.comparisons if each.measure == found.objective]
+    judged = [(each.against, each.difference, each.interval) for each in decisive]
     side = "left" if found.objective == "steps" else "right"
     titles = (
         f"{found.choice}, on {found.fresh_trials} fresh trials: {found.objective} less that of "

@@ -25,6 +25,7 @@ from holdfast.tuning.kept_trials import TrialRow
 FAMILY_LEVEL = 0.95  # confidence of all intervals of the objective together
 _WIDE = 0.1  # an interval that reaches so far, as a share of the mean, says little
 MUCH_SLOWER = 2.0
+GO_ON = "goes on (--resume; in Python the same out)"
 _NOTICED_MS = 0.5  # a decision that takes so many times as long, and so much longer, needs a reason
 
 
@@ -107,7 +108,7 @@ def judge(
         keep = _advice(choice, configured)
         sentence = (
             f"The budget was too short to judge: {trials} fresh trials of at least {least}. "
-            f"A larger one goes on (--resume); until then, {keep[0].lower()}{keep[1:]}."
+            f"A larger one {GO_ON}; until then, {keep[0].lower()}{keep[1:]}."
         )
         return Verdict(choice, False, sentence, ())
     pairs = [
@@ -198,16 +199,12 @@ def _sentence(
     if not matters:
         reach = max(abs(end) for each in decisive for end in each.interval)
         wide = reach > _WIDE * abs(decisive[0].value)
-        text = f"No difference showed in {fresh}"
-        if not wide:
-            text = f"What you sense does not matter here, as far as {fresh} tell"
-        text += f": {effects}. {_advice(choice, configured)}."
+        seen, unseen = f"What you sense does not matter here, as far as {fresh} tell", ""
         if wide:
-            text += (
-                f" One of up to {_amount(reach, objective)} would not have shown: "
-                "a larger budget may find it."
-            )
-        return text
+            seen = f"No difference showed in {fresh}"
+            unseen = f" One of up to {_amount(reach, objective)} would not have shown: "
+            unseen += "a larger budget may find it."
+        return f"{seen}: {effects}. {_advice(choice, configured)}.{unseen}"
     value = _amount(decisive[0].value, objective)
     text = f"{_advice(choice, configured)}: {value} on average in {fresh}; {effects}."
     for each in comparisons:
