@@ -25,6 +25,7 @@ _SHAPES = ((1,), (3, 4))  # leading shapes beside () and (n,)
 _SAME = 1e-9  # relative difference up to which a batch and its rows differ by rounding alone
 _DRAWS = 200  # of each of two samples that are compared
 _MANY_ACTIONS = 32  # bound on the sensing actions of which single states are tried
+_GIVEN_ACTIONS = ("limit_action", "move", "expected_move", "reward")  # those of the policy
 _INITIAL, _MOVE = 1, 2  # trial numbers of the streams here
 
 
@@ -33,8 +34,7 @@ def draw_observation(problem: Any, state: FloatArray, action: int, random: Strea
     if hasattr(problem, "sample_observation"):
         return checked.sample_observation(problem, state, action, random)
     mean, variance = _usable(problem, state, action)
-    shown: FloatArray = mean + np.sqrt(variance) * random.normal(mean.shape)
-    return shown
+    return np.asarray(mean + np.sqrt(variance) * random.normal(mean.shape))
 
 
 def acted(problem: Any, states: FloatArray, stages: Any) -> FloatArray:
@@ -133,9 +133,11 @@ def check_contract(inspection: Inspection, states: FloatArray, stages: IntArray)
 
     calls = list(_calls(inspection.problem))
     first = [(call, ask("contract", call, _once)) for call in calls]
-    # In another order, so that what a call leaves behind shows.
-    for call, before in reversed(first):
-        ask("purity", call, _again, before)
+    # In another order, so that what a call leaves behind shows, but first what others are given.
+    backwards = first[::-1]
+    for call, before in sorted(backwards, key=lambda each: each[0].function != "policy"):
+        if "policy" not in broken or call.function not in _GIVEN_ACTIONS:
+            ask("purity", call, _again, before)
     for call in calls:
         if call.by_rows:
             ask("contract", call, _by_rows)
