@@ -25,7 +25,8 @@ _SHAPES = ((1,), (3, 4))  # leading shapes beside () and (n,)
 _SAME = 1e-9  # relative difference up to which a batch and its rows differ by rounding alone
 _DRAWS = 200  # of each of two samples that are compared
 _MANY_ACTIONS = 32  # bound on the sensing actions of which single states are tried
-_GIVEN_ACTIONS = ("limit_action", "move", "expected_move", "reward")  # those of the policy
+_GIVEN_BY = dict.fromkeys(("limit_action", "move", "expected_move", "reward"), "policy")
+_GIVEN_BY["log_likelihood"] = "sample_observation"  # makes the arguments of the first
 _INITIAL, _MOVE = 1, 2  # trial numbers of the streams here
 
 
@@ -133,10 +134,9 @@ def check_contract(inspection: Inspection, states: FloatArray, stages: IntArray)
 
     calls = list(_calls(inspection.problem))
     first = [(call, ask("contract", call, _once)) for call in calls]
-    # In another order, so that what a call leaves behind shows, but first what others are given.
-    backwards = first[::-1]
-    for call, before in sorted(backwards, key=lambda each: each[0].function != "policy"):
-        if "policy" not in broken or call.function not in _GIVEN_ACTIONS:
+    first.reverse()  # so that what a call leaves behind shows
+    for call, before in sorted(first, key=lambda each: each[0].function in _GIVEN_BY):
+        if _GIVEN_BY.get(call.function) not in broken:
             ask("purity", call, _again, before)
     for call in calls:
         if call.by_rows:
