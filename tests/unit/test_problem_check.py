@@ -337,7 +337,7 @@ def test_of_a_bit_it_says_how_many_trials_end_wrong() -> None:
         assert each.where == CONTRACT
     inspection = Inspection(kind_of("StaticBit")(), PlanningSettings(), 200, 0, LONG_S)
     CHECKS["contract"](inspection)
-    assert "names bit, which has the values 0, 1 alone" in inspection.findings[0].seen
+    assert "names bit, with the values 0, 1 alone" in inspection.findings[0].seen
     assert inspection.findings[0].severity == W
 
 

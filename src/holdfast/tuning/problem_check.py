@@ -140,8 +140,8 @@ def _contract(inspection: Inspection) -> None:
     static = attributes.static_parameters(problem)
     if kinds := [at for at in static if 1 < len(np.unique(states[:, at])) < FEW_VALUES]:
         values = ", ".join(f"{each:g}" for each in np.unique(states[:, kinds]))
-        seen = f"static_parameters names {', '.join(map(inspection.coordinate, kinds))}, which has "
-        seen += f"the values {values} alone: resampling redraws it, and makes other numbers of it"
+        seen = f"static_parameters names {', '.join(map(inspection.coordinate, kinds))}, with the "
+        seen += f"values {values} alone: resampling would draw others, between and beyond these"
         advice = f"Leave {', '.join(map(str, kinds))} out. If such values get lost, {ADVICE}."
         inspection.add("warning", "contract", seen, advice)
     names = [inspection.coordinate(at) for at in range(min(states.shape[1], 8))]

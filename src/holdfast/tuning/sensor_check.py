@@ -65,11 +65,10 @@ def check_sensors(inspection: Inspection) -> None:
         advice += "selector.sensing_is_optional offers that for any problem."
         if told > 0.1 * _NOTHING:
             seen = f"{inspection.label(action)} tells little each time: "
-            advice = (
-                "Leave it out if another shows the same. If it alone shows what decides, compare "
-            )
+            advice = "Leave it out if others show the same. If it alone shows what decides, compare "
             advice += "selector.method: expected_return and rollout_sensing_steps: 8 with random."
-        seen += f"{told:.2g} nats in {len(beliefs)} beliefs of simulated trials"
+        seen += f"{told:.2g} nats in {len(beliefs)} belief{'s' * (len(beliefs) != 1)} of simulated "
+        seen += "trials"
         free = costs[action] < costs.max()
         inspection.add("information" if free else "warning", "sensors", seen, advice)
     _report_dominated(inspection, gains, silent, costs)
@@ -234,7 +233,7 @@ def _report_useless(
         if most < max(2.0 * _NOTHING, 0.03 * whole) and own.mean() < 0.15 * whole:
             seen = f"{inspection.label(action)} changes no task action by itself: it tells "
             seen += f"{whole:.2g} nats about the state and {max(own.mean(), 0.0):.2g} about the "
-            seen += f"next task action, in {count} beliefs of simulated trials"
+            seen += f"next task action, in {count} belief{'s' * (count != 1)} of simulated trials"
             advice = "If it counts later, or only together with another one, looking one step "
             advice += "ahead never chooses it: compare with selector.method: expected_return and "
             advice += "rollout_sensing_steps: 8, and with random. Else leave it out."
