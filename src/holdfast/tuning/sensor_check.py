@@ -65,7 +65,7 @@ def check_sensors(inspection: Inspection) -> None:
         advice += "selector.sensing_is_optional offers that for any problem."
         if told > 0.1 * _NOTHING:
             seen = f"{inspection.label(action)} tells little each time: "
-            advice = "Leave it out if others show the same. If it alone shows what decides, compare "
+            advice = "Leave it out if others show that. If it alone shows what decides, compare "
             advice += "selector.method: expected_return and rollout_sensing_steps: 8 with random."
         seen += f"{told:.2g} nats in {len(beliefs)} belief{'s' * (len(beliefs) != 1)} of simulated "
         seen += "trials"
