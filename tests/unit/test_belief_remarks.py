@@ -1,6 +1,7 @@
 """What a trial's beliefs tell: of what needs a setting or some noise, and of nothing else."""
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,18 @@ class TestDepletion:
         assert "docs/problems.md, Parameters that never change" in remark
         # The robot's own coordinate is another one in each particle.
         assert result.fewest_distinct_particles == 30
+
+    def test_what_static_parameters_cannot_redraw_is_told(self) -> None:
+        class Sharp(Beacon):
+            static_parameters = (1,)
+
+            def observation_variance(self, states: Any, sensing_action: int) -> Any:
+                return np.array([1e-12])
+
+        (remark,), _, _ = self.recorded(Sharp())
+        assert "had 1 different value left" in remark
+        assert re.search(r": an observation of (first|second) left about one particle at", remark)
+        assert "give line static_parameters" not in remark
 
     def test_nothing_is_told_of_what_moves_a_little(self) -> None:
         class Drifting(Beacon):

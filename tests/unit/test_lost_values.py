@@ -1,5 +1,6 @@
 """Beliefs that end sure of a wrong value: those that chance has misled, and no others."""
 
+import csv
 from typing import Any
 
 import msgspec
@@ -69,11 +70,14 @@ def test_right_certainty_and_what_has_no_few_values_do_not_count() -> None:
 
 def test_some_trials_may_lose_one_by_evidence() -> None:
     for lost, trials, many in ((1, 1, False), (2, 8, True), (5, 100, False), (6, 100, True)):
-        remark = remark_on_lost_values(
-            [("bit", "lid"), *(lost - 1) * [("bit",)], *trials * [()]][:trials]
+        given = [("bit", "lid"), *(lost - 1) * [("bit",)], *trials * [()]][:trials]
+        reached = [True, *(trials - 1) * [False]]
+        missed = f"({lost - 1} of these did not reach the goal)"
+        told = f"{lost} of {trials} parts ended sure of a wrong value {missed}: no particle had"
+        assert (
+            remark_on_lost_values(given, reached, "parts")
+            == f"{told} the true one of bit, lid" * many
         )
-        told = f"{lost} of {trials} trials ended sure of a wrong value: no particle had the true"
-        assert remark == f"{told} one of bit, lid" * many
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -85,5 +89,8 @@ def test_workers_and_tables_tell_the_same(jobs: int) -> None:
     assert [done[trial] for trial in range(8)] == expected[:8]
     trials = hf.run_trials(hf.Planner(problem, RANDOM), TRIALS, seed=3, max_steps=20, jobs=1)
     assert [each.lost_values for each in trials] == expected
+    remark = remark_on_lost_values(expected, [each.success for each in trials])
     for shown in (str(trials), trials._repr_html_()):
-        assert f"{remark_on_lost_values(expected)}. Resampling loses" in shown
+        assert f"{remark}. Resampling loses" in shown
+    rows = csv.DictReader(trials.to_csv().splitlines())
+    assert [row["lost_values"] for row in rows] == ["; ".join(each) for each in expected]

@@ -1,6 +1,7 @@
 """``hf.check_problem``: right problems have no error, and wrong ones have theirs named."""
 
 import importlib
+import itertools
 import random
 import re
 import sys
@@ -21,6 +22,7 @@ from holdfast.tuning.findings import CONTRACT, OVER, WHERE, Finding, Inspection
 from holdfast.tuning.problem_check import CHECKS, check_problem
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+GENERATOR, CALLS = np.random.default_rng(0), itertools.count()
 LONG_S = 3000.0
 """So that no busy machine cuts a check short."""
 
@@ -63,55 +65,12 @@ class Rover(Robot):
         return state[sensing_action] + self.deviation * stream.normal((1,))
 
 
-class OwnGenerator(Rover):
-    def __init__(self) -> None:
-        self.generator = np.random.default_rng(0)
-
-    def move(self, states: Any, actions: Any, stream: Any) -> Any:
-        return states + actions + 0.05 * self.generator.normal(size=states.shape)
-
-
-class Counts(Rover):
-    calls = 0
-
-    def policy(self, states: Any, stage: Any) -> Any:
-        self.calls += 1
-        return -states + 1e-3 * self.calls
-
-
-class ChangesItsArgument(Rover):
-    def limit_action(self, actions: Any) -> Any:
-        actions *= 0.5
-        return actions
-
-
-class KeepsItsStream(Rover):
-    kept: Any = None
-
-    def move(self, states: Any, actions: Any, stream: Any) -> Any:
-        self.kept = self.kept or stream
-        return states + actions + 0.05 * self.kept.normal(states.shape)
-
-
 class Slow(Rover):
     def limit_action(self, actions: Any) -> Any:
         return np.clip(actions, -0.0025, 0.0025)
 
     def move(self, states: Any, actions: Any, stream: Any) -> Any:
         return states + actions + 1e-3 * stream.normal(states.shape)
-
-
-class Misspelt(Rover):
-    def next_stages(self, estimates: Any, stage: Any) -> Any:
-        return stage
-
-    def sensing_cost(self) -> None:
-        """Not what holdfast asks for."""
-
-
-class GivesUp(Rover):
-    def policy(self, states: Any, stage: Any) -> Any:
-        raise SystemExit(3)
 
 
 class NoLimits:
@@ -218,6 +177,15 @@ Integers(Rover).reward: np.full(states.shape[:-1], -1)
 NeverAtTheGoal(Rover).is_goal: (np.abs(states - 9.0) < 0.2).all(axis=-1)
 AlwaysAtTheGoal(Rover).is_goal: (np.abs(states) < 99.0).all(axis=-1)
 NeverMoves(Rover).limit_action: 0.0 * actions
+ChangesItsArgument(Rover).limit_action: np.multiply(actions, 0.5, out=actions)
+KeepsItsStream(Rover).move:
+    states + actions + 0.05 * vars(self).setdefault("kept", stream).normal(states.shape)
+OwnGenerator(Rover).move: states + actions + 0.05 * GENERATOR.normal(size=states.shape)
+Counts(Rover).policy: -states + 1e-3 * next(CALLS)
+Misspelt(Rover).sensing_cost = 3.0
+GivesUp(Rover).policy: sys.exit(3)
+FailsAtTheGoal(Rover).is_failure: self.is_goal(states)
+Angles(Rover).circular_observations = ((), ())
 AlwaysFails(Rover).is_failure: states[..., 0] > -5.0
 ZeroReward(Rover).reward: np.zeros(np.broadcast_shapes(states.shape[:-1], actions.shape[:-1]))
 GoodReward(Rover).reward: np.ones(np.broadcast_shapes(states.shape[:-1], actions.shape[:-1]))
@@ -230,6 +198,7 @@ NoiseAsDeviation(Gaussian).motion_variance = np.array([0.05, 0.05])
 Dominated(Gaussian).deviations = (0.03, 0.1, 0.3)
 Silent(Gaussian).deviations = (0.1, 0.1, 1e6)
 WeakAlone(Gaussian).deviations = (0.01, 2.0)
+StaticBit(Bit).static_parameters = (1,)
 Priced(Gaussian).sensing_costs = (0.0, 2.0)
 """
 """Problems that are wrong in what one function returns, or in one attribute."""
@@ -281,7 +250,9 @@ WRONG = {
     "Misspelt": (W, "contract", "sensing_cost: did you mean sensing_costs"),
     "AlwaysAtTheGoal": (E, "goals", "all of 64 initial states are goals"),
     "NeverMoves": (E, "goals", "the policy never moves"),
-    "AlwaysFails": (E, "goals", "0 of 64 trials, and 64 fail"),
+    "AlwaysFails": (E, "goals", "0 of 64 trials, and 64 fail$"),
+    "FailsAtTheGoal": (E, "goals", "64 fail; 64 of the failures are at a goal"),
+    "Angles": (E, "contract", r"circular_observations .* leave it out, or give \(\)"),
     "CoarseResolution": (E, "resolution", "resolution is 1e\\+02, 1e\\+02, .* all of them are the"),
     "ZeroReward": (NOTE, "goals", "the reward is 0 in all"),
     "GoodReward": (W, "goals", "the reward is 1 in all"),
@@ -303,6 +274,14 @@ WRONG = {
 }
 
 
+ADVICE = {
+    "OneNumber": "np.array([value])",
+    "ChangesItsArgument": "Take a copy",
+    "Angles": "this attribute of the class",
+    "FailsAtTheGoal": "let is_failure be false where is_goal is true",
+}
+
+
 def check(problem: Any, **options: Any) -> list[Finding]:
     return check_problem(problem, max_steps=200, budget_s=LONG_S, **{"trials": 0, **options})
 
@@ -317,7 +296,10 @@ def test_what_is_wrong_is_named(kind: str) -> None:
     assert named, found
     assert named[0].severity == severity
     assert named[0].advice
-    assert ("np.array([value])" in named[0].advice) == (kind == "OneNumber")
+    for own, words in ADVICE.items():
+        assert (words in named[0].advice) == (kind == own)
+    if name == "purity":  # neither what calls it, nor the noise that it makes
+        assert [each.check for each in found if each.check in (name, "motion")] == [name]
     blamed = re.findall(r"\b(\w+) of rover returned", " ".join(each.seen for each in found))
     assert len(set(blamed)) == len(blamed)
     if severity == E:
@@ -346,9 +328,17 @@ def test_static_parameters_are_advised_where_none_are_declared(declared: tuple[i
 
 def test_of_a_bit_it_says_how_many_trials_end_wrong() -> None:
     found = [each for each in check(Bit()) if each.check == "depletion"]
-    assert re.search(r"[2-8] of 8 trials ended sure of a wrong .* true one of bit", found[0].seen)
-    assert "resampling_threshold: 0.5" in found[0].advice
-    assert not [each for each in found if "static_parameters" in each.advice]
+    ended = r"([2-8]) of 8 trials ended sure of a wrong value \(\1 of these did not reach the goal"
+    assert re.search(rf"{ended}\): .* true one of bit", found[0].seen)
+    for each in found:
+        assert "particle_filter.num_particles" in each.advice
+        assert "less sharp than they are" in each.advice
+        assert not re.search("static_parameters|threshold|more often", each.advice)
+        assert each.where == CONTRACT
+    inspection = Inspection(kind_of("StaticBit")(), PlanningSettings(), 200, 0, LONG_S)
+    CHECKS["contract"](inspection)
+    assert "names bit, with the values 0, 1 alone" in inspection.findings[0].seen
+    assert inspection.findings[0].severity == W
 
 
 RIGHT = [
@@ -416,12 +406,10 @@ def test_no_problem_at_all() -> None:
 
 
 def test_arguments_are_checked() -> None:
-    with pytest.raises(InvalidValueError, match="budget_s is 0"):
-        check_problem(Rover(), budget_s=0.0)
-    with pytest.raises(InvalidValueError, match="max_steps"):
-        check_problem(Rover(), max_steps=0)
-    with pytest.raises(InvalidValueError, match=r"'peg.yaml'.*load_configuration"):
-        check_problem("peg.yaml")
+    cases: Any = (({"budget_s": 0.0}, "budget_s is 0"), ({"max_steps": 0}, "max_steps"))
+    for given, says in (*cases, ({"problem": "peg.yaml"}, "'peg.yaml'.*load_configuration")):
+        with pytest.raises(InvalidValueError, match=says):
+            check_problem(**{"problem": Rover(), **given})
 
 
 def test_the_places_that_findings_name_are_there() -> None:

@@ -100,19 +100,11 @@ class TestResumeIfBegun:
         (out / "trials.csv").write_bytes(b"")
         assert "out: holds trials.csv already" in workplace.fails(*self.ARGUMENTS)
 
-    @pytest.mark.parametrize(
-        ("options", "expected"),
-        [
-            (("--resume-if-begun",), "--resume-if-begun needs --out DIR"),
-            (("--resume-if-begun", "--resume", "--out", "out"), "leave one of them out"),
-        ],
-    )
-    def test_what_does_not_go_together(
-        self, workplace: Workplace, options: tuple[str, ...], expected: str
-    ) -> None:
-        assert expected in workplace.fails("run", "peg.yaml", *options)
-        assert not (workplace.directory / "out").exists()
-        assert not (workplace.directory / "runs").exists()
+    def test_what_does_not_go_together(self, workplace: Workplace) -> None:
+        needs = workplace.fails("run", "peg.yaml", "--resume-if-begun")
+        assert "--resume-if-begun needs --out DIR" in needs
+        assert "leave one of them out" in workplace.fails(*self.ARGUMENTS, "--resume")
+        assert workplace.names() == {"peg.yaml"}
 
 
 def test_a_robot_without_services_tells_of_none(workplace: Workplace) -> None:
@@ -252,8 +244,11 @@ def test_how_many_trials_ended_sure_of_a_wrong_value(workplace: Workplace) -> No
     bit = PEG.replace("peg_in_hole_2d", "bits:Bit")
     workplace.write("bit.yaml", f"{bit}\nselector: {{method: random}}\n")
     said = workplace.runs("run", "bit.yaml", "--trials", "20", "--out", "out")
-    assert re.search(r"note: \d+ of 20 trials ended sure .* bit\. Resampling loses", said.stderr)
+    own = r"note: \d+ of 20 trials ended sure .* \(\d+ of these did .* bit\. Resampling loses"
+    assert re.search(own, said.stderr)
     assert "in trial 0" not in said.stderr
+    said = workplace.runs("run", "bit.yaml", "--trials", "40", "--out", "out", "--resume")
+    assert re.search(own.replace("trials", "trials of this part"), said.stderr)
 
 
 def test_values_instead_of_the_files_are_a_part_of_what_must_be_the_same_to_go_on(
@@ -267,18 +262,18 @@ def test_values_instead_of_the_files_are_a_part_of_what_must_be_the_same_to_go_o
     assert "model.init_mean[0] is 3.0 there and 4.0 here" in error
 
 
-def test_a_problem_is_no_file(workplace: Workplace) -> None:
-    error = workplace.fails("run", "capsule_robot")
-    assert "capsule_robot: there is no such file; capsule_robot is a problem" in error
-    assert "'problem: capsule_robot' is enough" in error
-
-
 def test_what_is_nearly_a_file_is_suggested(workplace: Workplace) -> None:
     assert workplace.fails("run", "pegg.yaml").endswith("no such file; did you mean peg.yaml?\n")
-    assert "'problem: lamps:Room' is enough" in workplace.fails("run", "lamps:Room")
+    for name in ("lamps:Room", "capsule_robot"):
+        error = workplace.fails("run", name)
+        assert f"{name}: there is no such file; {name} is a problem" in error
+        assert f"'problem: {name}' is enough" in error
     workplace.write("lamps.py", "")
     error = workplace.fails("run", "lamps.py")
     assert "lamps.py: is Python; lamps:CLASS is a problem, and a run needs" in error
+    workplace.write("lamps.py", "class Room: pass\n")
+    error = workplace.fails("run", "peg.yaml", "--out", "out", "--problem", "lamps")
+    assert "did you mean lamps:Room?" in error
 
 
 LICENSED = """
@@ -369,16 +364,6 @@ def test_with_log_json_the_error_is_an_event(
     assert event["event"] == "error"
     assert event["reason"].startswith(expected), event
     assert event["component"] == ("service" if command[0] == "serve" else "robot")
-
-
-def test_a_problem_whose_class_is_not_named(workplace: Workplace) -> None:
-    workplace.write(
-        "held_problem.py",
-        "from holdfast.problems.peg_in_hole_2d import PegInHole2D\n"
-        "class Held(PegInHole2D): name = 'held'\n",
-    )
-    said = workplace.fails("run", "peg.yaml", "--out", "out", "--problem", "held_problem")
-    assert "did you mean held_problem:Held?" in said
 
 
 class TestAfterAReboot:

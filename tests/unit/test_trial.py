@@ -23,17 +23,10 @@ from holdfast.robot.gymnasium_environment import GymnasiumEnvironment
 from holdfast.robot.trial import run_trial
 
 FAILING_PROBLEM = """
-import numpy as np
-
 from holdfast.errors import ProblemError
 from holdfast.problems.peg_in_hole_2d import PegInHole2D
 
-
 class Failing(PegInHole2D):
-    \"\"\"Fails in every trial once its initial states are asked for.\"\"\"
-
-    name = "failing"
-
     def initial_states(self, stream, count):
         raise {error}
 """

@@ -152,7 +152,7 @@ class Elsewhere(PegInHole2D):
         (
             OfANotebook,
             InvalidValueError,
-            r"needs cloudpickle: pip install 'holdfast-sensing\[tune\]', or",
+            r"needs cloudpickle: pip install 'hold.*\[tune\]'",
         ),
         (Elsewhere, TrialError, "peg_in_hole_2d cannot be made again in a worker process: ValueE"),
     ],

@@ -77,6 +77,10 @@ class Recursive(PegInHole2D):
     def turn(self, states, stage):
         return self.policy(states, stage)
 
+class InPlace(PegInHole2D):
+    def move(self, states, actions, stream):
+        states += actions
+
 class WithoutSetter(PegInHole2D):
     resolution = property(lambda self: 1.0)
 
@@ -134,6 +138,7 @@ class TestWhateverItRaises:
             ("WithoutWords", "raised Wordless, which cannot be put into words", "in policy"),
             ("WithManyWords", "raised ValueError: many\n", "in policy"),
             ("Recursive", "raised RecursionError: maximum", "in policy"),
+            ("InPlace", "is read-only\n", "in move\n    states += actions\nIt changes the array"),
             ("WithoutSetter", "cannot be built: AttributeError: property", ""),
         ],
     )

@@ -126,10 +126,13 @@ def _run(options: RunOptions) -> int:
         robot = RobotFindings()
         summary: RunSummary | None = None
         lost: list[tuple[str, ...]] = []
+        reached: list[bool] = []
+        which = "trials of this part" if directory.journal.finished() else "trials"
         started = perf_counter()
 
         def on_result(result: TrialResult) -> None:
             directory.add(result)
+            reached.append(result.success)
             display.show(result)
 
         try:
@@ -208,7 +211,7 @@ def _run(options: RunOptions) -> int:
             notes.note(remark.text)
         with notes.instead_of_errors("remarks on the beliefs"):
             problem, record = configuration.problem, recorder.record
-            if told := remark_on_lost_values(lost):
+            if told := remark_on_lost_values(lost, reached, which):
                 notes.note(f"{told}. {REMEDY}")
             planning, is_told = configuration.planning, bool(told)
             for text in belief_remarks(problem, planning, record, lost_are_told=is_told):

@@ -35,6 +35,9 @@ _MAX_LINES = 10
 _MAX_FRAMES = 5
 """Bounds on what an account has of a message, and of the frames at either end."""
 
+COPY = "It changes the array that it is given. Take a copy: states = states.copy()."
+"""What to do where NumPy says that an array is read-only."""
+
 _PACKAGE_FOLDERS = frozenset({"site-packages", "dist-packages"})
 
 
@@ -79,6 +82,8 @@ def account_of_user_error(error: BaseException, name: str) -> str | None:
         where = f'  File "{error.filename}", line {error.lineno}\n    {source:.{_MAX_TEXT}}'
     elif frames:
         where = _frames_listed(frames)
+        if isinstance(error, ValueError) and "read-only" in in_words(error):
+            where += f"\n{COPY}"
     else:
         return None
     return f"{name} raised {in_words(error)}\n{where}"

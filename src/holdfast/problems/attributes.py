@@ -222,7 +222,7 @@ def _check_coordinates(problem: Any) -> None:
     if has_general_observations(problem):
         raise ProblemError(
             f"circular_observations of {name} is {brief(given)}: it does nothing beside "
-            "log_likelihood, which has to know itself what is an angle; leave it out"
+            "log_likelihood, which has to know itself what is an angle; leave it out, or give ()"
         )
     if own is None or len(own) != count:
         raise ProblemError(

@@ -19,9 +19,10 @@ from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.belief import Belief
 from holdfast.planning.modes import heaviest_mode
 from holdfast.planning.settings import PlanningSettings
+from holdfast.problems import attributes
 from holdfast.problems.attributes import circular_states, coordinate_name, name_of, state_labels
 from holdfast.reports.recorder import TrialRecord
-from holdfast.robot.lost_values import REMEDY
+from holdfast.robot.lost_values import ADVICE, REMEDY
 from holdfast.robot.trial import SensingStep
 
 _SHARE = 0.2
@@ -65,12 +66,18 @@ def belief_remarks(
     if record.lost_values and not lost_are_told:
         names = ", ".join(record.lost_values)
         remarks.append(f"no particle had the true value of {names} at the end. {REMEDY}")
-    for at, least, step in _depleted(record):
+    for at, least, settled in _depleted(record):
+        advice = f"if it is continuous, give {name_of(problem)} static_parameters = ({at},), "
+        advice += "else take more particles"
+        if at in attributes.static_parameters(problem):
+            sensor = attributes.sensing_labels(problem)[settled.sensing_action]
+            advice = f"an observation of {sensor} left about one particle at step "
+            advice += f"{settled.before.step}, and static_parameters cannot spread one: {ADVICE}"
         remarks.append(
-            f"{coordinate_name(problem, at)} does not move, and by step {step} its particles had "
-            f"{least} different values left, of which the belief may be certain and wrong: if it "
-            f"is continuous, give {name_of(problem)} static_parameters = ({at},), else take more "
-            "particles (docs/problems.md, Parameters that never change)"
+            f"{coordinate_name(problem, at)} does not move, and by step "
+            f"{record.sensing[-1].before.step} its particles had {least} different "
+            f"value{'s' * (least != 1)} left, of which the belief may be certain and wrong: "
+            f"{advice} (docs/problems.md, Parameters that never change)"
         )
     failed = record.result is not None and not (record.result.success or record.lost_values)
     if failed and not remarks and settings.particle_filter.estimate == "mean":
@@ -92,8 +99,8 @@ def _has_modes(belief: Belief, circular: Sequence[int]) -> bool:
     return bool(kept) and heaviest_mode(own, weights, angles) is not weights
 
 
-def _depleted(record: TrialRecord) -> list[tuple[int, int, int]]:
-    """Return the depleted coordinates, with the values left at the last observation, and its step.
+def _depleted(record: TrialRecord) -> list[tuple[int, int, SensingStep]]:
+    """Return the depleted coordinates, how many values are left, and the step that left so few.
 
     A coordinate does not move if all particles have the same values after each move as before it.
     """
@@ -108,16 +115,13 @@ def _depleted(record: TrialRecord) -> list[tuple[int, int, int]]:
             np.array_equal(one[:, at], two[:, at]) for one, two in moves
         ):
             continue
+        values = (len(set(states[:, at].tolist())) for states in afters)
+        settled = next(step for step, left in zip(steps, values, strict=True) if left <= last)
+        by_chance = settled.observation_info.effective_sample_size < _FEW_EFFECTIVE
         varied, hidden = 2 * first > len(befores[0]), not record.true_states
-        if varied or (hidden and first > 1 and _is_by_chance(steps, at)):
-            found.append((at, last, steps[-1].before.step))
+        if varied or (hidden and first > 1 and by_chance):
+            found.append((at, last, settled))
     return found
-
-
-def _is_by_chance(steps: Sequence[SensingStep], at: int) -> bool:
-    """Return whether few effective particles were left when a coordinate's last values fell out."""
-    settled = next(step for step in steps if not np.ptp(step.after.belief.states[:, at]))
-    return settled.observation_info.effective_sample_size < _FEW_EFFECTIVE
 
 
 def _wraps(states: FloatArray, coordinate: int) -> bool:

@@ -19,11 +19,11 @@ from holdfast.problems.attributes import coordinate_name
 from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.trial import TrialObserver
 
-REMEDY = (
-    "Resampling loses such a value by chance where observations leave few particles: take more "
-    "(particle_filter.num_particles), declare the sharpest sensors less sharp, or resample less "
-    "often (particle_filter.resampling_threshold: 0.5)"
+ADVICE = (
+    "take more particles (particle_filter.num_particles), or declare the sharpest sensors less "
+    "sharp than they are"
 )
+REMEDY = f"Resampling loses such a value by chance where observations leave few particles: {ADVICE}"
 
 
 class LostValues(TrialObserver):
@@ -58,11 +58,16 @@ class LostValues(TrialObserver):
             )
 
 
-def remark_on_lost_values(trials: Sequence[Sequence[str]]) -> str:
-    """Return how many trials have lost which values; empty if evidence may have misled them."""
+def remark_on_lost_values(
+    trials: Sequence[Sequence[str]], reached: Sequence[bool] = (), which: str = "trials"
+) -> str:
+    """Return how many trials lost which values, and if these ``reached``; empty if few did."""
     count = sum(map(bool, trials))
     if count <= max(1.0, 0.05 * len(trials)):
         return ""
     names = ", ".join(sorted({name for lost in trials for name in lost}))
-    ended = f"{count} of {len(trials)} trials ended sure of a wrong value"
+    ended = f"{count} of {len(trials)} {which} ended sure of a wrong value"
+    if reached:
+        missed = sum(bool(lost) and not won for lost, won in zip(trials, reached, strict=True))
+        ended += f" ({missed} of these did not reach the goal)"
     return f"{ended}: no particle had the true one of {names}"

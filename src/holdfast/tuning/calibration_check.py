@@ -48,10 +48,9 @@ observation; the true particles, (r,); all particles' states, (r, n, state_size)
 def check_likelihoods(inspection: Inspection) -> None:
     """Test for each sensing action whether its samples follow its likelihood."""
     problem, late = inspection.problem, inspection.deadline(0.45, "likelihood")
-    count = len(sensing_labels(problem))
     function = "log_likelihood" if has_general_observations(problem) else "observation_mean"
     kinds = list(_beliefs(inspection))
-    for action in range(min(count, _MOST_ACTIONS)):
+    for action in range(min(len(sensing_labels(problem)), _MOST_ACTIONS)):
         if late():
             return
         with contextlib.suppress(CheckEndedError):
@@ -68,10 +67,8 @@ def _beliefs(inspection: Inspection) -> Iterator[tuple[str, list[FloatArray]]]:
     """Yield beliefs as wide as the initial one or the way, and as narrow as some moves."""
     problem, ask, walk = inspection.problem, inspection.ask, inspection.walk
     own = inspection.random(_INITIAL)
-    yield (
-        "the initial belief",
-        [ask("initial_states", checked.initial_states, problem, own, _PARTICLES)],
-    )
+    initial = ask("initial_states", checked.initial_states, problem, own, _PARTICLES)
+    yield "the initial belief", [initial]
     if walk is None:
         return
     count = len(walk.states)
@@ -195,8 +192,7 @@ def remedy_of(values: FloatArray, truths: IntArray) -> tuple[str, str] | None:
 
     finite = np.where(np.isfinite(values), values, np.finfo(float).min)
     negative = -finite / 1e3 if np.abs(finite).max() > 1e300 else -finite
-    advice = "The log-likelihood is greatest where the observation is likely: "
-    advice += "-0.5 * deviation * deviation."
+    advice = "The log-likelihood is greatest where the observation is likely: -0.5 * deviation**2."
     found = [(fit(negative), ". It fits better with the other sign", advice)]
     if likely := bool((values >= 0.0).all()):  # a log-likelihood hardly ever is
         seen = ". It fits better if the logarithm of the result is taken: log_likelihood seems to "

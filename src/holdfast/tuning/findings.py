@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
-from holdfast.config.user_code import account_of_user_error, in_words
+from holdfast.config.user_code import COPY, account_of_user_error, in_words
 from holdfast.errors import HoldfastError
 from holdfast.numerics.arrays import FloatArray, IntArray
 from holdfast.numerics.randomness import Purpose, Stream, stream
@@ -34,7 +34,6 @@ Severity = Literal["error", "warning", "information"]
 
 CONTRACT = "docs/problems.md#your-own"
 WHERE = {
-    "depletion": "docs/settings.md",
     "likelihood": "docs/problems.md#check-it",
     "method": "docs/tuning.md",
     "prices": "docs/problems.md#when-to-sense",
@@ -45,7 +44,7 @@ WHERE = {
 """What of the documentation says more, by check; of all others it is the contract."""
 
 _REMEDIES = (
-    ("read-only", "It changes the array that it is given. Take a copy: states = states.copy()."),
+    ("read-only", COPY),
     ("TimeoutError", "Look for a loop that need not end, such as one that draws until it fits."),
     (
         r"array of shape \(n,\)",
@@ -68,6 +67,7 @@ _REMEDIES = (
         "(states[..., 0]), and return what the table there says, as float64.",
     ),
     ("raised", "These are the lines of your own code."),
+    ("^the problem: ", "Change this attribute of the class."),
 )
 """Patterns of what is raised, and what to do; the first that fits counts."""
 
@@ -205,7 +205,7 @@ class Inspection:
         account, words = account_of_user_error(error, function), in_words(error)
         seen, details = f"{function} raised {words}", ""
         if account is not None:
-            details = account.removeprefix(seen).strip("\n")
+            details = account.removeprefix(seen).removesuffix(COPY).strip("\n")
         else:
             seen = str(error) if isinstance(error, HoldfastError) else words
             seen = seen if function in seen else f"{function}: {seen}"

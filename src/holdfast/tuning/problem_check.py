@@ -21,11 +21,12 @@ from holdfast.numerics.floating_mode import in_own_mode
 from holdfast.planning.settings import PlanningSettings, SimulatorSettings, check_settings
 from holdfast.printable import brief
 from holdfast.problems import attributes, checked
+from holdfast.robot.lost_values import ADVICE
 from holdfast.runtime.command_line import MAX_TRIALS
 from holdfast.tuning.calibration_check import check_likelihoods
 from holdfast.tuning.contract_check import check_contract, check_streams
 from holdfast.tuning.findings import CheckEndedError, Finding, Inspection
-from holdfast.tuning.sensor_check import check_sensors
+from holdfast.tuning.sensor_check import FEW_VALUES, check_sensors
 from holdfast.tuning.trial_check import check_decision_time, check_goals, check_method, check_trials
 from holdfast.validation import as_function
 
@@ -133,9 +134,16 @@ def _declarations(inspection: Inspection) -> None:
 
 def _contract(inspection: Inspection) -> None:
     """Check the contract in initial states, and say what was understood of noises."""
-    problem, own = inspection.problem, inspection.random(0)
-    states = inspection.ask("initial_states", checked.initial_states, problem, own, _DRAWN)
+    problem, own, ask = inspection.problem, inspection.random(0), inspection.ask
+    states = ask("initial_states", checked.initial_states, problem, own, _DRAWN)
     check_contract(inspection, states[:_STATES], np.zeros(_STATES, dtype=np.int64))
+    static = attributes.static_parameters(problem)
+    if kinds := [at for at in static if 1 < len(np.unique(states[:, at])) < FEW_VALUES]:
+        values = ", ".join(f"{each:g}" for each in np.unique(states[:, kinds]))
+        seen = f"static_parameters names {', '.join(map(inspection.coordinate, kinds))}, with the "
+        seen += f"values {values} alone: resampling would draw others, between and beyond these"
+        advice = f"Leave {', '.join(map(str, kinds))} out. If such values get lost, {ADVICE}."
+        inspection.add("warning", "contract", seen, advice)
     names = [inspection.coordinate(at) for at in range(min(states.shape[1], 8))]
     initial = ", ".join(f"{name} {states[:, at].std():.2g}" for at, name in enumerate(names))
     seen = f"standard deviations: of the initial belief {initial}; of the motion noise of a step "
@@ -143,7 +151,6 @@ def _contract(inspection: Inspection) -> None:
     if not attributes.has_general_observations(problem):
         shown = []
         for action, label in enumerate(attributes.sensing_labels(problem)[:8]):
-            ask = inspection.ask
             variance = ask("observation_variance", checked.prediction, problem, states, action)[1]
             # What is not positive is a finding of its own.
             least, most = np.sqrt(np.maximum([variance.min(), variance.max()], 0.0))

@@ -36,7 +36,7 @@ _HYPOTHESES = 32  # trial number of the first of the streams here
 _MOST_ACTIONS = 32
 _BINS = 8  # of a task action's coordinate, to see whether an observation changes it
 _NOTHING = 0.02  # nats of information below which a sensing action tells nothing
-_FEW_VALUES = 10  # of a coordinate in all trials, below which it is a kind and no number
+FEW_VALUES = 10  # of a coordinate, below which it is a kind and no number
 _SCALES = 30.0  # between coordinates of the task action with one resolution for all
 
 
@@ -65,17 +65,15 @@ def check_sensors(inspection: Inspection) -> None:
         advice += "selector.sensing_is_optional offers that for any problem."
         if told > 0.1 * _NOTHING:
             seen = f"{inspection.label(action)} tells little each time: "
-            advice = "Leave it out if another one shows the same. If it alone shows what decides, "
-            advice += (
-                "compare selector.method: expected_return and rollout_sensing_steps: 8 with random."
-            )
-        seen += f"{told:.2g} nats in {len(beliefs)} beliefs of simulated trials"
+            advice = "Leave it out if others show that. If it alone shows what decides, compare "
+            advice += "selector.method: expected_return and rollout_sensing_steps: 8 with random."
+        seen += f"{told:.2g} nats in {len(beliefs)} belief{'s' * (len(beliefs) != 1)} of simulated "
+        seen += "trials"
         free = costs[action] < costs.max()
         inspection.add("information" if free else "warning", "sensors", seen, advice)
     _report_dominated(inspection, gains, silent, costs)
-    given = inspection.settings.selector.resolution
-    if inspection.settings.selector.method == "state_entropy":
-        given = None
+    selector = inspection.settings.selector
+    given = None if selector.method == "state_entropy" else selector.resolution
     own = inspection.ask("resolution", lambda: resolution_of(problem, given, of_states=False))
     resolution = np.broadcast_to(np.asarray(own, dtype=np.float64), (problem.action_size,))
     _report_useless(inspection, gains, silent, resolution)
@@ -196,8 +194,7 @@ def _report_dominated(
             if better == worse or costs[better] > costs[worse]:
                 continue
             left = (1.0 - shares[worse]) / np.maximum(1.0 - shares[better], 1e-9)
-            apart = gains.states[:, worse] - gains.states[:, better]
-            apart = np.where(known[:, worse], apart, 0.0)
+            apart = np.where(known[:, worse], gains.states[:, worse] - gains.states[:, better], 0.0)
             # What neither of them shows scatters, as an observation leaves few particles. What the
             # worse one shows beyond chance, the better one must show beyond doubt.
             chance = 2.0 * apart.std(axis=0) / np.sqrt(len(apart))
@@ -236,7 +233,7 @@ def _report_useless(
         if most < max(2.0 * _NOTHING, 0.03 * whole) and own.mean() < 0.15 * whole:
             seen = f"{inspection.label(action)} changes no task action by itself: it tells "
             seen += f"{whole:.2g} nats about the state and {max(own.mean(), 0.0):.2g} about the "
-            seen += f"next task action, in {count} beliefs of simulated trials"
+            seen += f"next task action, in {count} belief{'s' * (count != 1)} of simulated trials"
             advice = "If it counts later, or only together with another one, looking one step "
             advice += "ahead never chooses it: compare with selector.method: expected_return and "
             advice += "rollout_sensing_steps: 8, and with random. Else leave it out."
@@ -300,7 +297,7 @@ def _tolerance(inspection: Inspection, walk: Walk) -> FloatArray:
         return np.zeros(problem.action_size)
     base = ask("policy", checked.policy, problem, goals, stages)
     for at in range(rows.shape[1]):
-        if len(np.unique(rows[:, at])) < _FEW_VALUES:
+        if len(np.unique(rows[:, at])) < FEW_VALUES:
             continue  # a bit or a kind has no width
         apart = np.zeros(rows.shape[1])
         apart[at] = 4.0 * rows[:, at].std()

@@ -74,7 +74,8 @@ class TrialSummary(Table):
     def __init__(self, trials: Trials) -> None:
         self._title, self._limit = str(trials.label), trials.max_steps
         self.estimates = estimates_of(trials.results, step_limit=self._limit)
-        lost = remark_on_lost_values([each.lost_values for each in trials])
+        reached = [each.success for each in trials]
+        lost = remark_on_lost_values([each.lost_values for each in trials], reached)
         self._remarks = [f"{lost}. {REMEDY}."] if lost else []
 
     def columns(self) -> Sequence[str]:
@@ -99,7 +100,7 @@ class TrialSummary(Table):
 class Trials(Table):
     """Simulated trials of one planner: a row for each trial.
 
-    The columns are those of ``trials.csv`` and ``sensing_price``. A notebook shows the summary.
+    Its columns: ``trials.csv``'s, ``sensing_price``, ``lost_values``. A notebook shows a summary.
 
     Attributes
     ----------
@@ -123,12 +124,13 @@ class Trials(Table):
 
     def columns(self) -> Sequence[str]:
         """Return the names of the columns, for programs."""
-        return (*TRIAL_COLUMNS, "sensing_price")
+        return (*TRIAL_COLUMNS, "sensing_price", "lost_values")
 
     def rows(self) -> Iterator[tuple[object, ...]]:
         """Yield a row for each trial."""
-        names = self.columns()
-        return (tuple(getattr(result, name) for name in names) for result in self.results)
+        for each in self.results:
+            plain = tuple(getattr(each, name) for name in (*TRIAL_COLUMNS, "sensing_price"))
+            yield (*plain, "; ".join(each.lost_values))
 
     def shown(self) -> list[tuple[str, ...]]:
         """Return a row for each trial, with the columns that people compare."""

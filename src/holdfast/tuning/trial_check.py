@@ -26,7 +26,7 @@ from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.problems import attributes, checked
 from holdfast.problems.problem import ProblemBase
-from holdfast.robot.lost_values import REMEDY, LostValues, remark_on_lost_values
+from holdfast.robot.lost_values import ADVICE, REMEDY, LostValues, remark_on_lost_values
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 from holdfast.tuning.contract_check import acted, check_contract
 from holdfast.tuning.findings import CheckEndedError, Inspection, Severity, Walk, spread_out
@@ -51,7 +51,8 @@ def check_goals(inspection: Inspection) -> None:
     chosen = spread_out(_CHOSEN, len(walk.states))
     if len(chosen) == _CHOSEN:
         check_contract(inspection, walk.states[chosen], walk.stages[chosen])
-    _check_motion(inspection, walk)
+    if all(each.check != "purity" for each in inspection.findings):
+        _check_motion(inspection, walk)
 
 
 def _follow_policy(inspection: Inspection) -> Walk:
@@ -61,7 +62,7 @@ def _follow_policy(inspection: Inspection) -> Walk:
     own = inspection.random(_INITIAL)
     states = ask("initial_states", checked.initial_states, problem, own, _WALKS)
     stages = np.zeros(_WALKS, dtype=np.int64)
-    reached, failed = np.full((2, _WALKS), -1)
+    reached, failed = np.full(_WALKS, -1), np.zeros(_WALKS, dtype=np.int64)
     kept: list[tuple[FloatArray, IntArray]] = []
     jumps = np.zeros((2, states.shape[1]), dtype=np.int64)
     turns = np.zeros((2, problem.action_size), dtype=np.int64)
@@ -70,9 +71,9 @@ def _follow_policy(inspection: Inspection) -> Walk:
     while True:
         done = ask("is_goal", checked.truths, problem, "is_goal", states)
         lost = ask("is_failure", checked.truths, problem, "is_failure", states)
-        running = (reached < 0) & (failed < 0)
-        reached[running & done] = step
-        failed[running & lost & ~done] = step
+        running = (reached < 0) & (failed == 0)
+        reached[running & done & ~lost] = step
+        failed[running & lost] = 1 + done[running & lost]  # 2: although it is at a goal
         if step % stride == 0:
             kept.append((states, stages))
         if len(kept) > 2 * _KEPT:  # so that a long trial takes no more memory
@@ -141,7 +142,7 @@ def _report_walk(
     seen += "trials"
     if reached.any():
         seen += f", after {np.median(walk.reached[reached]):.0f} steps (median)"
-    if lost := int((failed >= 0).sum()):
+    if lost := int((failed > 0).sum()):
         seen += f", and {lost} fail"
     if running := _WALKS - int(reached.sum()) - lost:
         seen += f"; {running} have not ended after {steps} steps"
@@ -152,7 +153,10 @@ def _report_walk(
     if reached.mean() >= _ENOUGH:
         needed = int(np.quantile(walk.reached[reached], 0.9))
         advice = f"Set simulator.max_steps to {2 * needed} or more."
-    if cut or in_time.mean() >= _ENOUGH:
+    if missed := int((failed == 2).sum()):
+        seen += f"; {missed} of the failures are at a goal"
+        advice = "A trial fails even at a goal: let is_failure be false where is_goal is true."
+    if not missed and (cut or in_time.mean() >= _ENOUGH):
         inspection.add("information", "goals", seen)
     else:
         inspection.add("warning" if in_time.any() else "error", "goals", seen, advice)
@@ -166,13 +170,11 @@ def _check_rewards(inspection: Inspection) -> None:
     rewards, selector = np.array(inspection.rewards), inspection.settings.selector
     if not rewards.size or np.ptp(rewards) > 0.0 or rewards[0] < 0.0:
         return
-    seen = f"the reward is {rewards[0]:g} in all of {len(rewards)} simulated steps: "
     severity: Severity = "information"
+    tells = "expected_return has nothing to tell sensing actions by"
     if rewards[0] > 0.0:
-        severity = "warning"
-        seen += "a trial that never reaches the goal has the greatest return"
-    else:
-        seen += "expected_return has nothing to tell sensing actions by"
+        severity, tells = "warning", "a trial that never reaches the goal has the greatest return"
+    seen = f"the reward is {rewards[0]:g} in all of {len(rewards)} simulated steps: {tells}"
     if selector.method == "expected_return" and selector.rollout_reward == "problem":
         severity = "error"
     advice = "selector.rollout_reward: steps counts steps instead, as without a reward."
@@ -255,7 +257,8 @@ def check_trials(inspection: Inspection) -> None:
             results.append(_simulated(inspection, planner, trial, steps, watcher))
     if results:
         _report_endings(inspection, results, steps)
-    if remark := remark_on_lost_values([each.lost for each in watchers[: len(results)]]):
+    reached = [result.success for result in results]
+    if remark := remark_on_lost_values([each.lost for each in watchers[: len(results)]], reached):
         inspection.add("warning", "depletion", f"with random sensing, {remark}", f"{REMEDY}.")
     _report_depletion(inspection, [each for each in watchers if each.steps], remark)
     states = [step.before for watcher in watchers for step in watcher.steps]
@@ -309,13 +312,11 @@ def check_method(inspection: Inspection) -> None:
         inspection.add_over("method")
         return
     difference, (low, high) = mean_difference(np.array(more))
-    words = "takes {:+.3g} [{:+.3g}, {:+.3g}] steps (a failure: the limit)"
-    shown = difference, low, high
+    words, shown = "takes {} steps (a failure: the limit)", (difference, low, high)
     if priced:
-        words = "earns {:+.3g} [{:+.3g}, {:+.3g}] of reward"
-        shown = -difference, -high, -low
-    seen = f"{method} {words.format(*shown)} beside random "
-    seen += f"sensing in {count} paired trials: "
+        words, shown = "earns {} of reward", (-difference, -high, -low)
+    effect = words.format("{:+.3g} [{:+.3g}, {:+.3g}]".format(*shown))
+    seen = f"{method} {effect} beside random sensing in {count} paired trials: "
     if low > 0.0:
         advice = "Run holdfast tune, which finds what suits this problem. Of methods that are as "
         advice += "good as random sensing, one in thirty is called worse by chance."
@@ -348,23 +349,17 @@ def _report_depletion(inspection: Inspection, trials: list[_Watcher], lost: str)
     """Report what observations leave of the particles, and how often the truth is beyond them."""
     if not trials:
         return
-    left = [
-        (step.sensing_action, step.observation_info.effective_sample_size)
-        for trial in trials
-        for step in trial.steps
-    ]
+    left = [(step.sensing_action, step.observation_info) for own in trials for step in own.steps]
     particles = inspection.settings.particle_filter.num_particles
     few = []
     for action in range(len(attributes.sensing_labels(inspection.problem))):
-        sizes = np.array([size for own, size in left if own == action])
+        sizes = np.array([info.effective_sample_size for own, info in left if own == action])
         if len(sizes) >= 5 and (share := (sizes < _FEW_LEFT).mean()) > _OFTEN:
             few.append(f"{inspection.label(action)} in {share:.0%} of {len(sizes)} observations")
     if few:
         seen = f"sensors are too sharp for {particles} particles: often fewer than {_FEW_LEFT:.0f} "
         seen += f"count afterwards (effective sample size), with {', '.join(few)}"
-        advice = "Take more particles (particle_filter.num_particles), sense more often, or "
-        advice += "declare the sensor a little less sharp than it is."
-        inspection.add("warning", "depletion", seen, advice)
+        inspection.add("warning", "depletion", seen, f"{ADVICE[0].upper()}{ADVICE[1:]}.")
     # Each trial counts the same.
     outside = [np.array(trial.outside) for trial in trials]
     shares = np.mean([each.mean(axis=0) for each in outside], axis=0)
@@ -375,7 +370,7 @@ def _report_depletion(inspection: Inspection, trials: list[_Watcher], lost: str)
         seen = f"in {whole:.0%} of the beliefs before sensing, over {len(trials)} trials with "
         seen += f"random sensing, the true state lies beyond all {particles} particles in some "
         seen += f"coordinate, most often in {inspection.coordinate(at)} ({shares[at]:.0%})"
-        advice = "An observation leaves few for other coordinates: take more, or sense more often."
+        advice = f"An observation leaves few for other coordinates: {ADVICE}."
         if not lost and not attributes.static_parameters(inspection.problem):
             advice += " Name continuous values that never change in static_parameters."
         inspection.add("warning", "depletion", seen, advice)
