@@ -276,7 +276,7 @@ WRONG = {
 
 ADVICE = {
     "OneNumber": "np.array([value])",
-    "ChangesItsArgument": "Take a copy",
+    "ChangesItsArgument": "take a copy",
     "Angles": "this attribute of the class",
     "FailsAtTheGoal": "let is_failure be false where is_goal is true",
 }

@@ -128,7 +128,7 @@ class Mean(Line):
 """
 
 
-@pytest.mark.parametrize(("last", "why"), [(60, "for lack of time"), (1000, "as others are")])
+@pytest.mark.parametrize(("last", "why"), [(60, "for lack of time"), (1000, "others were chosen")])
 def test_no_trial_begins_when_time_is_up(
     run: Path, monkeypatch: pytest.MonkeyPatch, last: int, why: str
 ) -> None:

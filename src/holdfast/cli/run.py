@@ -213,7 +213,7 @@ def _run(options: RunOptions) -> int:
             problem, record = configuration.problem, recorder.record
             if told := remark_on_lost_values(lost, reached, which):
                 notes.note(f"{told}. {REMEDY}")
-            planning, is_told = configuration.planning, bool(told)
+            planning, is_told = configuration.planning, bool(told) or len(lost) > 1
             for text in belief_remarks(problem, planning, record, lost_are_told=is_told):
                 notes.note(f"in trial {recorder.trial}, {text}")
         if summary.unverified_answers:

@@ -73,7 +73,7 @@ class Configuration:
     environment : EnvironmentSettings
         ``directory`` is where its module was found; None for one that is installed.
     given, overrides : mapping
-        The keys of each section that are not left out; values instead of the file's, by key.
+        The keys that the file or an override gives, by section; what replaces the file's values.
     """
 
     problem: Problem = field(compare=False, repr=False)

@@ -35,7 +35,7 @@ _MAX_LINES = 10
 _MAX_FRAMES = 5
 """Bounds on what an account has of a message, and of the frames at either end."""
 
-COPY = "It changes the array that it is given. Take a copy: states = states.copy()."
+COPY = "If it changes an array that it was given, take a copy: states = states.copy()."
 """What to do where NumPy says that an array is read-only."""
 
 _PACKAGE_FOLDERS = frozenset({"site-packages", "dist-packages"})

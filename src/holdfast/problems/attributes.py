@@ -152,7 +152,9 @@ def _misspelt(kind: type, of_instance: frozenset[str]) -> str:
     import difflib
 
     # One that the problem has was hardly meant by another.
-    lacking = sorted(known - names)
+    lacking = sorted(
+        known - names - {*(GAUSSIAN_OBSERVATIONS if "log_likelihood" in names else ())}
+    )
     found = [
         f"{name}: did you mean {meant[0]}?"
         for name in sorted(names - known)

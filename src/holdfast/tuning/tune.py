@@ -133,7 +133,8 @@ def tune(
     if not isinstance(configuration, Configuration):
         kind = "a path, or what load_configuration returns"
         configuration = load(as_path("configuration", configuration, kind))
-    for each in vary if isinstance(vary, list | tuple) else [vary]:
+    vary = vary if isinstance(vary, list | tuple) else [vary]  # type: ignore[list-item]
+    for each in vary:
         if not isinstance(each, str) or each not in VARIATIONS:
             allowed = ", ".join(VARIATIONS) + close_match(str(each), VARIATIONS)
             raise InvalidValueError(f"vary has {brief(each)}; allowed are {allowed}")
@@ -228,6 +229,7 @@ class _Tuner:
         for _ in self._measured(wanted):
             pass
         judged = [name for name in judged if name not in self._failed]
+        self._notes |= {name: "judged" for name in judged if name not in finalists}
         fresh = next(
             trial
             for trial in range(most_fresh + 1)
@@ -254,7 +256,8 @@ class _Tuner:
         left_out |= self._failed
         for name, reason in list(left_out.items())[:_MOST_REFUSED]:
             sentence += f" {name} was left out: {reason.splitlines()[0]}."
-        few = [each for each in standings if each.trials < most]
+        late = {name for name, note in self._notes.items() if note.endswith("for lack of time")}
+        few = [each for each in standings if each.trials < most or each.candidate in late]
         untried = sum(each.state == "set aside" and each.trials <= PILOT_TRIALS for each in few)
         unjudged = sum(each.state == "in the race" and each.candidate not in judged for each in few)
         sentence += _note(len(left_out) - _MOST_REFUSED, "left out, too: the table says why")
@@ -325,7 +328,8 @@ class _Tuner:
             judged = self._judged([*found, name])
             needed_s = 3 * _LEAST_FRESH * sum(each_s.get(each, 0.0) for each in judged)
             has_room = len(found) < 2 + (winner in _JUDGED_ANYWAY)
-            self._notes[name] = f"not judged, {'for lack of time' if has_room else 'as others are'}"
+            why = "for lack of time" if has_room else "others were chosen"
+            self._notes[name] = f"not judged, {why}"
             if has_room and needed_s <= self.jobs * (self._budget_s - self._spent_s()):
                 found.append(name)
         self._notes |= dict.fromkeys(found, "a finalist")

@@ -135,7 +135,7 @@ def tuned_yaml(configuration: Configuration, found: Tuning) -> str:
         plain = msgspec.to_builtins(SETTINGS[section]()) if section in SETTINGS else now
         kept = {key: now[key] for key in now if key in given or now[key] != plain[key]}
         data |= {section: kept} if kept else {}
-    head = [f"# {line}\n" for line in ("By holdfast tune.", found.sentence)]
+    head = [f"# {line}\n" for line in ("By holdfast tune.", " ".join(found.sentence.split()))]
     for key, value in found.changes.items():
         section, _, name = key.partition(".")
         before = msgspec.json.encode(resolved[section][name]).decode()
