@@ -96,7 +96,9 @@ def test_the_configuration_itself_dies_or_hangs(
 def test_it_says_that_particles_are_too_few(run: Path) -> None:
     (run.parent / "bits.py").write_text("from tests.unit.test_lost_values import Bit\n")
     base = load(run, problem="bits:Bit", overrides={"simulator.max_steps": 20})
-    found = tuned(base, vary=["fixed"], most=20)
+    found = tuned(base, vary="fixed", most=20)
+    assert "was not tried" not in found.sentence
+    assert [each.state for each in found.candidates][1] == "in the race: judged"
     given = f"{run} --problem bits:Bit --set simulator.max_steps=20"
     assert f" Your configuration, here, is {given}." in found.sentence
     more = f"tune {given} --set particle_filter.num_particles=300."

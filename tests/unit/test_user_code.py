@@ -138,7 +138,7 @@ class TestWhateverItRaises:
             ("WithoutWords", "raised Wordless, which cannot be put into words", "in policy"),
             ("WithManyWords", "raised ValueError: many\n", "in policy"),
             ("Recursive", "raised RecursionError: maximum", "in policy"),
-            ("InPlace", "is read-only\n", "in move\n    states += actions\nIt changes the array"),
+            ("InPlace", "is read-only\n", "in move\n    states += actions\nIf it changes an array"),
             ("WithoutSetter", "cannot be built: AttributeError: property", ""),
         ],
     )
