@@ -65,7 +65,7 @@ class KeptTrials:
             whole = content[: content.rfind(b"\n") + 1]
             lines = whole.decode(errors="replace").split("\n")
             self.rows = {(row.candidate, row.trial): row for row in _rows_of(lines)}
-            self._require_the_same(directory / SETTINGS_NAME)
+            self._require_the_same(directory / SETTINGS_NAME, is_new=not content)
             # What a kill has cut short goes. The rest stays as it is: a disk may be full.
             self._file.truncate(len(whole))
             if not whole:
@@ -81,15 +81,15 @@ class KeptTrials:
             with contextlib.suppress(OSError):  # what a full disk does not take was an error before
                 self._file.close()
 
-    def _require_the_same(self, path: Path) -> None:
+    def _require_the_same(self, path: Path, *, is_new: bool) -> None:
         settings = msgspec.to_builtins(self._settings)
         try:
             there = msgspec.json.decode(path.read_bytes())
         except FileNotFoundError:
-            if self.rows:
+            if not is_new:
                 raise OutputError(
-                    f"{shown_path(path)}: is gone, so nothing tells of which tuning the trials of "
-                    f"{TRIALS_NAME} are; choose another directory"
+                    f"{shown_path(path)}: is not there, so {TRIALS_NAME} is of a run, or nobody "
+                    "knows of which tuning; choose another directory"
                 ) from None
             write_atomically(path, msgspec.json.format(msgspec.json.encode(settings), indent=2))
             return
