@@ -22,7 +22,7 @@ from holdfast.planning.settings import PlanningSettings
 from holdfast.problems import attributes
 from holdfast.problems.attributes import circular_states, coordinate_name, name_of, state_labels
 from holdfast.reports.recorder import TrialRecord
-from holdfast.robot.lost_values import ADVICE, REMEDY
+from holdfast.robot.lost_values import ADVICE, FEW_LEFT, REMEDY
 from holdfast.robot.trial import SensingStep
 
 _SHARE = 0.2
@@ -30,9 +30,6 @@ _SHARE = 0.2
 
 _FEW = 0.03
 """Share of its first values that a depleted coordinate still has, at most."""
-
-_FEW_EFFECTIVE = 3.0
-"""Effective particles below which chance decides what an observation leaves of few values."""
 
 
 @in_own_mode
@@ -117,7 +114,7 @@ def _depleted(record: TrialRecord) -> list[tuple[int, int, SensingStep]]:
             continue
         values = (len(set(states[:, at].tolist())) for states in afters)
         settled = next(step for step, left in zip(steps, values, strict=True) if left <= last)
-        by_chance = settled.observation_info.effective_sample_size < _FEW_EFFECTIVE
+        by_chance = settled.observation_info.effective_sample_size < FEW_LEFT
         varied, hidden = 2 * first > len(befores[0]), not record.true_states
         if varied or (hidden and first > 1 and by_chance):
             found.append((at, last, settled))

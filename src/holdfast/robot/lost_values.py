@@ -19,6 +19,9 @@ from holdfast.problems.attributes import coordinate_name
 from holdfast.robot.environment import Environment, SimulatedEnvironment
 from holdfast.robot.trial import TrialObserver
 
+FEW_LEFT = 3.0
+"""Effective particles below which chance decides what an observation leaves."""
+
 ADVICE = (
     "take more particles (particle_filter.num_particles), or declare the sharpest sensors less "
     "sharp than they are"

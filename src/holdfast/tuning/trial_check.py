@@ -26,7 +26,7 @@ from holdfast.planning.outcome import TrialResult
 from holdfast.planning.planner import Planner, PlanningState
 from holdfast.problems import attributes, checked
 from holdfast.problems.problem import ProblemBase
-from holdfast.robot.lost_values import ADVICE, REMEDY, LostValues, remark_on_lost_values
+from holdfast.robot.lost_values import ADVICE, FEW_LEFT, REMEDY, LostValues, remark_on_lost_values
 from holdfast.robot.trial import SensingStep, TaskStep, TrialObserver, run_trial
 from holdfast.tuning.contract_check import acted, check_contract
 from holdfast.tuning.findings import CheckEndedError, Inspection, Severity, Walk, spread_out
@@ -42,7 +42,6 @@ _BELIEFS, _PARTICLES = 24, 400  # beliefs before sensing that are kept, and part
 _FEWEST_PAIRS = 10  # of trials from which an interval is made
 _ENOUGH = 0.5  # share of the trials that should reach the goal
 _OFTEN = 0.2  # share of the observations from which on it is worth a warning
-_FEW_LEFT = 3.0  # effective particles below which an observation leaves hardly any
 
 
 def check_goals(inspection: Inspection) -> None:
@@ -354,10 +353,10 @@ def _report_depletion(inspection: Inspection, trials: list[_Watcher], lost: str)
     few = []
     for action in range(len(attributes.sensing_labels(inspection.problem))):
         sizes = np.array([info.effective_sample_size for own, info in left if own == action])
-        if len(sizes) >= 5 and (share := (sizes < _FEW_LEFT).mean()) > _OFTEN:
+        if len(sizes) >= 5 and (share := (sizes < FEW_LEFT).mean()) > _OFTEN:
             few.append(f"{inspection.label(action)} in {share:.0%} of {len(sizes)} observations")
     if few:
-        seen = f"sensors are too sharp for {particles} particles: often fewer than {_FEW_LEFT:.0f} "
+        seen = f"sensors are too sharp for {particles} particles: often fewer than {FEW_LEFT:.0f} "
         seen += f"count afterwards (effective sample size), with {', '.join(few)}"
         inspection.add("warning", "depletion", seen, f"{ADVICE[0].upper()}{ADVICE[1:]}.")
     # Each trial counts the same.

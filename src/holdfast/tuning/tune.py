@@ -199,6 +199,7 @@ class _Tuner:
         self._killed: set[tuple[str, int]] = set()
         self._counted: set[tuple[str, int]] = set()
         self._longest_s: dict[str, float] = {}
+        self._notes: dict[str, str] = {}  # of candidates in the race, whether and why not judged
         self._doing = ""
         self._began_s = monotonic()
         self._budget_s = self._until_s = math.inf
@@ -310,7 +311,7 @@ class _Tuner:
     def _finalists(self, standings: Sequence[Standing]) -> list[str]:
         """Return the winner, and one that may be as good, two if the winner is judged anyway."""
         winner = standings[0].candidate
-        costs, equals, self._notes = self._costs(winner), [], {}
+        costs, equals = self._costs(winner), []
         for each in standings[1:]:
             own = self._costs(each.candidate)
             common = min(len(own), len(costs))
@@ -320,8 +321,8 @@ class _Tuner:
             self._notes[each.candidate] = "not judged, the winner leads in common trials"
             if np.mean(differences) <= 2.0 * np.std(differences, ddof=1) / math.sqrt(common):
                 equals.append(each.candidate)
-        taken_ms = {name: self._decision_ms(name) for name in (winner, *equals) if equals}
-        quick = [name for name in equals if MUCH_SLOWER * taken_ms[name] <= taken_ms[winner]]
+        own_ms = self._decision_ms(winner) if equals else 0.0
+        quick = [name for name in equals if MUCH_SLOWER * self._decision_ms(name) <= own_ms]
         each_s = {each.candidate: each.seconds for each in standings}
         found = [winner]
         for name in dict.fromkeys([*quick[:1], *equals]):

@@ -195,11 +195,11 @@ def tuning_figure(found: Tuning) -> bytes:
 
     from holdfast.reports.figure import STYLE
 
-    of_race = [each for each in found.candidates if each.interval is not None]
     in_unit = functools.partial(_in_its_unit, found.objective)
     raced: list[tuple[Any, ...]] = [
-        (each.candidate, *in_unit(each.difference or 0.0), in_unit(*each.interval or ()))
-        for each in of_race
+        (each.candidate, *in_unit(each.difference or 0.0), in_unit(*each.interval))
+        for each in found.candidates
+        if each.interval is not None
     ]
     decisive = [each for each in found.comparisons if each.measure == found.objective]
     judged = [(each.against, each.difference, each.interval) for each in decisive]
